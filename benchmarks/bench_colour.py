@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 from airl_mav.arena.geometry import Arena
-from airl_mav.camera.colour import render_colour
+from airl_mav.camera.colour import Work, render_colour
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.picture import ColourArrays
 from airl_mav.camera.textures import atlas
@@ -27,13 +27,14 @@ ROUNDS = 15
 
 
 @kernel
-def colour_all(rgb, depth, seen, position, attitude, focal, cx, cy, bounds, shape, center, half,
-               yaw, texture, per_m, offset, albedo, lights, patterns):  # type: ignore[no-untyped-def] # fmt: skip
+def colour_all(rgb, depth, seen, work, position, attitude, focal, cx, cy, bounds, shape, center,
+               half, yaw, texture, per_m, offset, albedo, lights, patterns):  # type: ignore[no-untyped-def] # fmt: skip
     for i in range(len(position)):
         p, q = position[i], attitude[i]
         render_colour(
-            rgb, depth, seen, (p[0], p[1], p[2]), (q[0], q[1], q[2], q[3]), focal, cx, cy, False,
-            bounds, shape, center, half, yaw, texture, per_m, offset, albedo, lights, patterns,
+            rgb, depth, seen, work, (p[0], p[1], p[2]), (q[0], q[1], q[2], q[3]), focal, cx, cy,
+            False, bounds, shape, center, half, yaw, texture, per_m, offset, albedo, lights,
+            patterns,
         )  # fmt: skip
 
 
@@ -43,13 +44,14 @@ def rates(arena: Arena, k: Intrinsics, poses: tuple[np.ndarray, np.ndarray]) -> 
     bodies = (arena.bounds.as_array(), o.shape, o.center, o.half_size, o.yaw)
     depth, seen = np.empty(shape, np.float32), np.empty(shape, np.int32)
     rgb, patterns = np.empty((*shape, 3), np.uint8), atlas()
+    work = Work.of(k.width, k.height, False)
     surfaces = (look.texture, look.per_m, look.offset, look.albedo, look.lights, patterns)
     times: tuple[list[float], list[float]] = ([], [])
     for _ in range(ROUNDS):
         start = time.perf_counter()
         render_all(depth, *poses, k.focal, k.cx, k.cy, *bodies)
         middle = time.perf_counter()
-        colour_all(rgb, depth, seen, *poses, k.focal, k.cx, k.cy, *bodies, *surfaces)
+        colour_all(rgb, depth, seen, work, *poses, k.focal, k.cx, k.cy, *bodies, *surfaces)
         times[0].append(middle - start)
         times[1].append(time.perf_counter() - middle)
     return POSES / min(times[0]), POSES / min(times[1])

@@ -7,7 +7,7 @@ loop along a line vectorises.
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +18,16 @@ from airl_mav.arena.appearance import WALLS as WALLS_ROW
 from airl_mav.camera.primitives import OBSTACLE, Ids
 from airl_mav.camera.projection import MIN_DEPTH_M, Pose
 from airl_mav.camera.raycast import aim, draw_bodies, invert
-from airl_mav.camera.shading import F32, ZERO, Lit, Packed, Plane, Points, surface_of
+from airl_mav.camera.shading import F32, ZERO, Lit, Packed, Plane, Points, Rays, surface_of
 from airl_mav.camera.shadows import CORNERS, shade_by_obstacle, shade_by_walls
-from airl_mav.camera.surfaces import draw_sky, shade_obstacle, shade_room
+from airl_mav.camera.surfaces import (
+    BLOCK,
+    draw_sky,
+    shade_floor,
+    shade_obstacle,
+    shade_walls,
+    write_rays,
+)
 from airl_mav.core.kernels import kernel
 from airl_mav.vehicle.rotation import Quat, Vec
 
@@ -28,11 +35,49 @@ RANGE_M: Final = 10_000.0
 """How far a colour camera sees [m]: beyond every arena."""
 
 
+class Work(NamedTuple):
+    """Room to work in for images of n lines of m pixels; nothing in it outlasts a call."""
+
+    lines: NDArray[np.float64]  # (n, 2)
+    xs: NDArray[np.float64]  # (m,)
+    far: Plane  # (n, m)
+    ids: Ids  # (n, m)
+    lit: Plane  # (n, m)
+    clear: Plane  # (n, m)
+    out: Packed  # (n m,)
+    rays: Rays
+    points: Points
+    corners: NDArray[np.float64]  # (CORNERS, 3)
+
+    @classmethod
+    def of(cls, width: int, height: int, cylindrical: bool) -> Work:
+        """Return the room for images of a size; lines are rows, or columns of a cylinder."""
+        n, m = (width, height) if cylindrical else (height, width)
+        block = max(BLOCK, m)
+
+        def floats(*shape: int) -> Plane:
+            return np.zeros(shape, np.float32)
+
+        return cls(
+            np.zeros((n, 2)),
+            np.zeros(m),
+            floats(n, m),
+            np.zeros((n, m), np.int32),
+            floats(n, m),
+            floats(n, m),
+            np.zeros(n * m, np.int32),
+            Rays(floats(n * m), floats(n * m), floats(n * m)),
+            Points(np.zeros(block, np.int32), floats(block), floats(block), floats(block)),
+            np.zeros((CORNERS, 3)),
+        )
+
+
 @kernel
 def render_colour(
     rgb: NDArray[np.uint8],
     depth: Plane,
     seen: Ids,
+    work: Work,
     position: Vec | NDArray[np.float64],
     quaternion: Quat | NDArray[np.float64],
     focal: float,
@@ -59,6 +104,7 @@ def render_colour(
             written; 0: no surface.
         seen: (height, width) what each pixel sees, written: SKY, FLOOR, ... of `primitives`, for an
             obstacle OBSTACLE + its number.
+        work: For this size of image.
         position: As of `render_depth`, with the rest up to `yaw`.
         quaternion: (4,).
         focal: Focal length.
@@ -79,12 +125,9 @@ def render_colour(
         atlas: `textures.atlas()`.
     """
     camera = (position[0], position[1], min(position[2], -MIN_DEPTH_M))
-    height, width = depth.shape
-    n_lines, n_pixels = (width, height) if cylindrical else (height, width)
-    xs, lines = np.empty(n_pixels), np.empty((n_lines, 2))
+    lines, xs = work.lines, work.xs
     view, axes = aim(lines, xs, quaternion, focal, cx, cy, cylindrical, RANGE_M)
-    far = np.empty((n_lines, n_pixels), np.float32) if cylindrical else depth
-    ids = np.empty((n_lines, n_pixels), np.int32) if cylindrical else seen
+    far, ids = (work.far, work.ids) if cylindrical else (depth, seen)
     rectangles = np.zeros((len(shape), 3, 4), np.int32)
     inside = draw_bodies(
         far, ids, rectangles, lines, xs, view, axes, camera, bounds, shape, center, half_size, yaw
@@ -96,44 +139,37 @@ def render_colour(
         return
     invert(far)
     light = _lit(lights)
-    lit, clear = (
-        np.empty((n_lines, n_pixels), np.float32),
-        np.empty((n_lines, n_pixels), np.float32),
-    )
-    out = np.empty((n_lines, n_pixels), np.int32)
-    points = Points(
-        np.empty(n_pixels, np.int32),
-        np.empty(n_pixels, np.float32),
-        np.empty(n_pixels, np.float32),
-        np.empty(n_pixels, np.float32),
-    )
+    lit, clear, out, points, rays = work.lit, work.clear, work.out, work.points, work.rays
+    write_rays(rays, lines, xs, axes)
     to_sun = (float(lights[0, 0]), float(lights[0, 1]), float(lights[0, 2]))
+    all_ids, all_far, all_lit, all_clear = ids.ravel(), far.ravel(), lit.ravel(), clear.ravel()
     extinction = float(light.extinction)
-    shade_by_walls(lit, clear, far, lines, xs, axes, camera, bounds, to_sun, extinction)
-    corners = np.empty((CORNERS, 3))
+    shade_by_walls(all_lit, all_clear, all_far, rays, camera, bounds, to_sun, extinction)
     sunny = max(max(light.sun[0], light.sun[1]), light.sun[2]) > ZERO
     for i in range(len(shape)):
         if sunny:
             world, half = _placed(axes, camera, center, half_size, i)
             shade_by_obstacle(
-                lit, far, ids, corners, i, lines, xs, view, world, camera, shape[i], half, yaw[i],
-                to_sun,
+                lit, far, ids, work.corners, i, lines, xs, view, world, camera, shape[i], half,
+                yaw[i], to_sun,
             )  # fmt: skip
-    draw_sky(out, ids, points, lines, xs, axes, camera, light)
+    draw_sky(out, all_ids, points, rays, camera, light)
     pixel2 = F32(1.0 / (focal * focal))
     floor = surface_of(texture, per_m, offset, albedo, FLOOR_ROW)
     walls = surface_of(texture, per_m, offset, albedo, WALLS_ROW)
-    shade_room(
-        out, ids, far, lit, clear, points, lines, xs, axes, camera, floor, walls, light, atlas,
-        pixel2,
-    )  # fmt: skip
+    shade_floor(
+        out, all_ids, all_far, all_lit, all_clear, points, rays, camera, floor, light, atlas, pixel2
+    )
+    shade_walls(
+        out, all_ids, all_far, all_lit, all_clear, points, rays, camera, walls, light, atlas, pixel2
+    )
     for i in range(len(shape)):
         world, half = _placed(axes, camera, center, half_size, i)
         surface = surface_of(texture, per_m, offset, albedo, OBSTACLE_ROW + i)
         for k in range(3 if cylindrical else 1):
             shade_obstacle(
-                out, ids, far, lit, clear, points, rectangles[i, k], i, lines, xs, world, shape[i],
-                half, yaw[i], surface, light, atlas, pixel2,
+                out, all_ids, all_far, all_lit, all_clear, points, rectangles[i, k], i, lines, xs,
+                world, shape[i], half, yaw[i], surface, light, atlas, pixel2,
             )  # fmt: skip
     _unpack(rgb, out, cylindrical)
     if cylindrical:
@@ -167,19 +203,19 @@ def _lit(lights: NDArray[np.float32]) -> Lit:
 
 @kernel
 def _unpack(rgb: NDArray[np.uint8], out: Packed, cylindrical: bool) -> None:
-    """Write the image of its packed lines."""
+    """Write the image of its packed pixels, line after line."""
+    height, width, _ = rgb.shape
     if cylindrical:
-        for v in range(rgb.shape[0]):
-            for u in range(rgb.shape[1]):
-                colour = out[u, v]
+        for v in range(height):
+            for u in range(width):
+                colour = out[u * height + v]
                 rgb[v, u, 0] = colour & 255
                 rgb[v, u, 1] = (colour >> 8) & 255
                 rgb[v, u, 2] = (colour >> 16) & 255
         return
-    for v in range(rgb.shape[0]):
-        row, pixels = rgb[v], out[v]
-        for u in range(len(pixels)):
-            colour = pixels[u]
-            row[u, 0] = colour & 255
-            row[u, 1] = (colour >> 8) & 255
-            row[u, 2] = (colour >> 16) & 255
+    pixels = rgb.reshape(height * width, 3)
+    for u in range(height * width):
+        colour = out[u]
+        pixels[u, 0] = colour & 255
+        pixels[u, 1] = (colour >> 8) & 255
+        pixels[u, 2] = (colour >> 16) & 255

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from airl_mav.arena.appearance import FLOOR as FLOOR_ROW
 from airl_mav.arena.appearance import TEXTURES, Drawn, linear_of, srgb_of
 from airl_mav.arena.geometry import Arena
-from airl_mav.camera.colour import render_colour
+from airl_mav.camera.colour import Work, render_colour
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.textures import PERIOD, atlas, means
 from airl_mav.vehicle.rotation import Quat, Vec
@@ -77,6 +77,7 @@ def render_picture(
     )
     render_colour(
         *picture,
+        Work.of(k.width, k.height, k.cylindrical),
         position,
         quaternion,
         k.focal,

@@ -55,6 +55,14 @@ class Points(NamedTuple):
     """What the texture is there."""
 
 
+class Rays(NamedTuple):
+    """The ray of every pixel, line after line, along north, east and down."""
+
+    north: Plane  # (n,)
+    east: Plane  # (n,)
+    down: Plane  # (n,)
+
+
 class Lit(NamedTuple):
     """The light of an arena, linear RGB."""
 
@@ -122,7 +130,6 @@ def paint(
     seen: Packed,
     lit: Plane,
     clear: Plane,
-    v: int,
     left: int,
     end: int,
     first: np.int32,
@@ -132,18 +139,17 @@ def paint(
     light: Lit,
     atlas: Plane,
 ) -> None:
-    """Write the packed sRGB of a part of a line where it sees a surface.
+    """Write the packed sRGB of a part of an image where it sees a surface.
 
     Lambert's law for the sun; the sky and the ground by the shares that a tilted plane sees of
     them, (1 + cos tilt) / 2 and (1 - cos tilt) / 2 (Liu and Jordan, The long-term average
     performance of flat-plate solar-energy collectors, 1963); fog by Beer-Lambert's law.
 
     Args:
-        out: (n, m) packed colours, written.
-        seen: (n, m) what is seen.
-        lit: (n, m) 1 in the sun, 0 in shadow.
-        clear: (n, m) share of light that the fog lets through.
-        v: Which line.
+        out: (n,) packed colours, written.
+        seen: (n,) what is seen.
+        lit: (n,) 1 in the sun, 0 in shadow.
+        clear: (n,) share of light that the fog lets through.
         left: Where the part begins.
         end: Where it ends.
         first: Least number of this surface in `seen`.
@@ -154,30 +160,29 @@ def paint(
         atlas: `textures.atlas()`.
     """
     place, facing, up, pattern = points
-    row, marks = out[v, left:end], seen[v, left:end]
-    lit_row, clear_row = lit[v, left:end], clear[v, left:end]
+    row, marks = out[left:end], seen[left:end]
+    lit_row, clear_row = lit[left:end], clear[left:end]
     # By itself: a loop that reads from all over the atlas does not vectorise.
     for u in range(end - left):
         pattern[u] = atlas[surface.base + place[u]]
-    dark, more, sun, sky, ground = (
-        surface.albedo,
-        surface.more,
-        light.sun,
-        light.sky,
-        light.ground,
+    dark, more, sun, horizon = surface.albedo, surface.more, light.sun, light.horizon
+    # Of sky and ground: what an upright plane gets of both, and how much more a level one.
+    upright = (
+        HALF * (light.sky[0] + light.ground[0]),
+        HALF * (light.sky[1] + light.ground[1]),
+        HALF * (light.sky[2] + light.ground[2]),
     )
-    horizon = light.horizon
+    level = (light.sky[0] - upright[0], light.sky[1] - upright[1], light.sky[2] - upright[2])
     for u in range(end - left):
         value, through = pattern[u], clear_row[u]
-        direct, above, below = lit_row[u] * facing[u], HALF + HALF * up[u], HALF - HALF * up[u]
-        fog = ONE - through
-        red = (dark[0] + more[0] * value) * (direct * sun[0] + above * sky[0] + below * ground[0])
-        green = (dark[1] + more[1] * value) * (direct * sun[1] + above * sky[1] + below * ground[1])
-        blue = (dark[2] + more[2] * value) * (direct * sun[2] + above * sky[2] + below * ground[2])
+        direct, rise = lit_row[u] * facing[u], up[u]
+        red = (dark[0] + more[0] * value) * (direct * sun[0] + (upright[0] + rise * level[0]))
+        green = (dark[1] + more[1] * value) * (direct * sun[1] + (upright[1] + rise * level[1]))
+        blue = (dark[2] + more[2] * value) * (direct * sun[2] + (upright[2] + rise * level[2]))
         colour = packed(
-            through * red + fog * horizon[0],
-            through * green + fog * horizon[1],
-            through * blue + fog * horizon[2],
+            horizon[0] + through * (red - horizon[0]),
+            horizon[1] + through * (green - horizon[1]),
+            horizon[2] + through * (blue - horizon[2]),
         )
         row[u] = colour if (marks[u] >= first) & (marks[u] <= last) else row[u]
 
@@ -187,16 +192,18 @@ def encoded(x: np.float32) -> np.int32:
     """Return linear light as an sRGB number, 0..255 (IEC 61966-2-1).
 
     The power is a polynomial of the root, fitted for the least greatest error: 0.09 of a step.
+    Nothing is darker than 0.
     """
-    x = min(max(x, ZERO), ONE)
+    x = min(x, ONE)
     s = np.sqrt(x)
     curve = F32(-413.73478559914724) + F32(131.81300432715605) * s
     curve = F32(517.7284762186123) + curve * s
     curve = F32(-357.54480524554555) + curve * s
     curve = F32(387.0472913646104) + curve * s
-    curve = F32(-10.226101032503605) + curve * s
-    curve = curve if x > F32(0.0031308) else F32(12.92 * 255.0) * x
-    return I32(min(curve, F32(255.0)) + HALF)
+    # Half a step more: the whole number below is the nearest one.
+    curve = F32(-10.226101032503605 + 0.5) + curve * s
+    straight = F32(12.92 * 255.0) * x + HALF
+    return I32(curve if x > F32(0.0031308) else straight)
 
 
 @kernel

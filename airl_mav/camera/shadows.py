@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from airl_mav.camera.primitives import BOX, CYLINDER, OBSTACLE, Ids, Line, Lines, turned
 from airl_mav.camera.projection import Pose, Rectangle, View, dot
-from airl_mav.camera.shading import F32, ONE, ZERO, Plane, Vec32
+from airl_mav.camera.shading import F32, ONE, ZERO, Plane, Rays, Vec32
 from airl_mav.core.kernels import kernel
 from airl_mav.vehicle.rotation import Vec
 
@@ -41,12 +41,12 @@ def sized(value: float) -> float:
 
 
 @kernel
-def widened(left: int, end: int, n: int) -> tuple[int, int]:
-    """Return the pixels left..end of n with their neighbours, in whole vectors.
+def widened(left: int, end: int, low: int, high: int) -> tuple[int, int]:
+    """Return the pixels left..end with their neighbours from low to high, in whole vectors.
 
     What is left over of a loop for vectors is done one by one: for what is small, all of it.
     """
-    return left - left % VECTOR, min(end + (-end) % VECTOR, n)
+    return max(left - left % VECTOR, low), min(end + (-end) % VECTOR, high)
 
 
 @kernel
@@ -54,9 +54,7 @@ def shade_by_walls(
     lit: Plane,
     clear: Plane,
     far: Plane,
-    lines: Lines,
-    xs: Line,
-    axes: Pose,
+    rays: Rays,
     camera: Vec,
     bounds: NDArray[np.float64],
     to_sun: Vec,
@@ -65,12 +63,10 @@ def shade_by_walls(
     """Write which points the walls leave in the sun, and how much of their light fog lets through.
 
     Args:
-        lit: (n, m) written: 1 in the sun, 0 in shadow.
-        clear: (n, m) written: share of light that fog on the way to the camera lets through.
-        far: (n, m) depth [m]; 0: no surface.
-        lines: Of the image.
-        xs: Rays of a line.
-        axes: The camera's.
+        lit: (n,) written: 1 in the sun, 0 in shadow.
+        clear: (n,) written: share of light that fog on the way to the camera lets through.
+        far: (n,) depth [m]; 0: no surface.
+        rays: Of the pixels.
         camera: (3,) NED [m].
         bounds: (5,) of the arena.
         to_sun: (3,) unit vector NED.
@@ -82,22 +78,18 @@ def shade_by_walls(
     edge_e = F32((bounds[3] if east > 0.0 else bounds[2]) - camera[1])
     per_n, per_e = F32(1.0 / north), F32(1.0 / east)
     above, height = F32(-camera[2]), F32(bounds[4])
-    r0, r1, r2 = F32(axes.along[0]), F32(axes.along[1]), F32(axes.along[2])
-    for v in range(len(lines)):
-        d0, d1, d2 = start32(axes, lines[v, 0], lines[v, 1])
-        far_row, lit_row, clear_row = far[v], lit[v], clear[v]
-        for u in range(len(xs)):
-            x, t = F32(xs[u]), far_row[u]
-            n, e, d = t * (d0 + x * r0), t * (d1 + x * r1), t * (d2 + x * r2)
-            run = min((edge_n - n) * per_n, (edge_e - e) * per_e)
-            over = above - d + run * up
-            lit_row[u] = ZERO if (run > _STEP_M and over < height) else ONE
-            clear_row[u] = ONE
-        if extinction > 0.0:
-            for u in range(len(xs)):
-                x, t = F32(xs[u]), far_row[u]
-                n, e, d = t * (d0 + x * r0), t * (d1 + x * r1), t * (d2 + x * r2)
-                clear_row[u] = math.exp(-extinction * math.sqrt(n * n + e * e + d * d))
+    for u in range(len(far)):
+        t = far[u]
+        n, e, d = t * rays.north[u], t * rays.east[u], t * rays.down[u]
+        run = min((edge_n - n) * per_n, (edge_e - e) * per_e)
+        over = above - d + run * up
+        lit[u] = ZERO if (run > _STEP_M and over < height) else ONE
+        clear[u] = ONE
+    if extinction > 0.0:
+        for u in range(len(far)):
+            t = far[u]
+            n, e, d = t * rays.north[u], t * rays.east[u], t * rays.down[u]
+            clear[u] = math.exp(-extinction * math.sqrt(n * n + e * e + d * d))
 
 
 @kernel
@@ -162,7 +154,7 @@ def shade_by_obstacle(
         )
     if top >= bottom or left >= end:
         return
-    left, end = widened(left, end, len(xs))
+    left, end = widened(left, end, 0, len(xs))
     f, c, r = pose, pose.center, pose.along
     c0, c1, c2 = F32(c[0]), F32(c[1]), F32(c[2])
     r0, r1, r2 = F32(r[0]), F32(r[1]), F32(r[2])

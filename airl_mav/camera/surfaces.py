@@ -1,7 +1,7 @@
 """Sky, floor, walls and obstacles in colour, each where the image sees them.
 
-A line is shaded in three steps: where its points lie in the pattern and how they face the light,
-then the texels, then the colours.
+Images are one line after the other here. They are shaded in blocks, in three steps: where points
+lie in the pattern and how they face the light, then the texels, then the colours.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ from airl_mav.camera.shading import (
     Packed,
     Plane,
     Points,
+    Rays,
     Surface,
     packed,
     paint,
@@ -47,6 +48,9 @@ from airl_mav.camera.textures import SIDE
 from airl_mav.core.kernels import kernel
 from airl_mav.vehicle.rotation import Vec
 
+BLOCK: Final = 512
+"""Pixels that are shaded together, so that what is noted of them stays near the processor."""
+
 FOG_LAYER_M: Final = 100.0
 """Height of the fog above the floor, seen towards the sky [m]."""
 
@@ -56,13 +60,13 @@ _STEEP: Final = F32(0.02)  # least cosine between ray and normal for the size of
 
 @kernel
 def _span(
-    ids: Ids, v: int, left: int, end: int, first: np.int32, last: np.int32
+    ids: Ids, low: int, high: int, left: int, end: int, first: np.int32, last: np.int32
 ) -> tuple[int, int]:
-    """Return the pixels of a part of a line from the first to the last that sees a surface.
+    """Return the pixels left..end from the first to the last that sees a surface.
 
-    They begin and end with whole vectors. Its numbers are first..last.
+    They begin and end with whole vectors, from low to high. Its numbers are first..last.
     """
-    seen, length = ids[v, left:end], I32(end - left)
+    seen, length = ids[left:end], I32(end - left)
     begin, stop = length, I32(0)
     for u in range(end - left):
         here = (seen[u] >= first) & (seen[u] <= last)
@@ -71,35 +75,46 @@ def _span(
         stop = max(stop, I32(at + I32(1)) if here else I32(0))
     if stop == 0:
         return 0, 0
-    return widened(left + int(begin), left + int(stop), ids.shape[1])
+    return widened(left + int(begin), left + int(stop), low, high)
 
 
 @kernel
-def draw_sky(
-    out: Packed,
-    ids: Ids,
-    points: Points,
-    lines: Lines,
-    xs: Line,
-    axes: Pose,
-    camera: Vec,
-    light: Lit,
-) -> None:
+def write_rays(rays: Rays, lines: Lines, xs: Line, axes: Pose) -> None:
+    """Write the ray of every pixel of an image's lines."""
+    r0, r1, r2 = F32(axes.along[0]), F32(axes.along[1]), F32(axes.along[2])
+    n = len(xs)
+    for v in range(len(lines)):
+        d0, d1, d2 = start32(axes, lines[v, 0], lines[v, 1])
+        north, east, down = (
+            rays.north[v * n : v * n + n],
+            rays.east[v * n : v * n + n],
+            rays.down[v * n : v * n + n],
+        )
+        for u in range(n):
+            x = F32(xs[u])
+            north[u], east[u], down[u] = d0 + x * r0, d1 + x * r1, d2 + x * r2
+
+
+@kernel
+def draw_sky(out: Packed, ids: Ids, points: Points, rays: Rays, camera: Vec, light: Lit) -> None:
     """Write what is seen where there is no surface: sky, and below the horizon level ground.
 
     The ground beyond the walls is as bright as the floor is in the mean.
     """
-    r0, r1, r2 = F32(axes.along[0]), F32(axes.along[1]), F32(axes.along[2])
     above = F32(max(-camera[2], MIN_DEPTH_M))
     zenith, horizon, ground = light.zenith, light.horizon, light.ground
     rises, clear = points.up, points.pattern
-    for v in range(len(lines)):
-        left, end = _span(ids, v, 0, len(xs), I32(SKY), I32(SKY))
-        d0, d1, d2 = start32(axes, lines[v, 0], lines[v, 1])
-        row, x_row = out[v, left:end], xs[left:end]
+    begin, stop = _span(ids, 0, len(ids), 0, len(ids), I32(SKY), I32(SKY))
+    for left in range(begin, stop, BLOCK):
+        end = min(left + BLOCK, stop)
+        row, norths, easts, downs = (
+            out[left:end],
+            rays.north[left:end],
+            rays.east[left:end],
+            rays.down[left:end],
+        )
         for u in range(end - left):
-            x = F32(x_row[u])
-            n, e, d = d0 + x * r0, d1 + x * r1, d2 + x * r2
+            n, e, d = norths[u], easts[u], downs[u]
             rises[u] = -d / np.sqrt(n * n + e * e + d * d)
             clear[u] = ONE
         if light.extinction > 0.0:
@@ -108,18 +123,14 @@ def draw_sky(
                 clear[u] = math.exp(-light.extinction * thick / max(abs(rises[u]), LEAST))
         for u in range(end - left):
             rise, through = rises[u], clear[u]
-            fog, share = ONE - through, max(rise, ZERO)
-            red = horizon[0] + share * (zenith[0] - horizon[0])
-            green = horizon[1] + share * (zenith[1] - horizon[1])
-            blue = horizon[2] + share * (zenith[2] - horizon[2])
-            red = red if rise >= ZERO else ground[0]
-            green = green if rise >= ZERO else ground[1]
-            blue = blue if rise >= ZERO else ground[2]
-            row[u] = packed(
-                through * red + fog * horizon[0],
-                through * green + fog * horizon[1],
-                through * blue + fog * horizon[2],
-            )
+            share = through * max(rise, ZERO)
+            red = share * (zenith[0] - horizon[0])
+            green = share * (zenith[1] - horizon[1])
+            blue = share * (zenith[2] - horizon[2])
+            red = red if rise >= ZERO else through * (ground[0] - horizon[0])
+            green = green if rise >= ZERO else through * (ground[1] - horizon[1])
+            blue = blue if rise >= ZERO else through * (ground[2] - horizon[2])
+            row[u] = packed(horizon[0] + red, horizon[1] + green, horizon[2] + blue)
 
 
 @kernel
@@ -130,60 +141,77 @@ def _texels2(surface: Surface, pixel2: np.float32) -> np.float32:
 
 
 @kernel
-def shade_room(
+def shade_floor(
     out: Packed,
     ids: Ids,
     far: Plane,
     lit: Plane,
     clear: Plane,
     points: Points,
-    lines: Lines,
-    xs: Line,
-    axes: Pose,
+    rays: Rays,
     camera: Vec,
     floor: Surface,
+    light: Lit,
+    atlas: Plane,
+    pixel2: np.float32,
+) -> None:
+    """Shade the floor. Its pattern begins in the start."""
+    at0, at1 = F32(camera[0]), F32(camera[1])
+    sun_up = -light.to_sun[2]
+    # The camera's height is t times the ray's slope.
+    texel = _texels2(floor, pixel2) / F32(max(-camera[2], MIN_DEPTH_M))
+    own = I32(FLOOR)
+    begin, stop = _span(ids, 0, len(ids), 0, len(ids), own, own)
+    for left in range(begin, stop, BLOCK):
+        end = min(left + BLOCK, stop)
+        depths, norths, easts = far[left:end], rays.north[left:end], rays.east[left:end]
+        for u in range(end - left):
+            t = depths[u]
+            across = (at1 + t * easts[u]) * floor.per_m + floor.offset[0]
+            along = floor.offset[1] - (at0 + t * norths[u]) * floor.per_m
+            points.place[u] = texel_at(across, along, texel * t * t * t)
+            points.facing[u] = sun_up
+            points.up[u] = ONE
+        paint(out, ids, lit, clear, left, end, own, own, points, floor, light, atlas)
+
+
+@kernel
+def shade_walls(
+    out: Packed,
+    ids: Ids,
+    far: Plane,
+    lit: Plane,
+    clear: Plane,
+    points: Points,
+    rays: Rays,
+    camera: Vec,
     walls: Surface,
     light: Lit,
     atlas: Plane,
     pixel2: np.float32,
 ) -> None:
-    """Shade floor and walls. Their patterns begin in the start, and at the foot of a wall."""
-    r0, r1, r2 = F32(axes.along[0]), F32(axes.along[1]), F32(axes.along[2])
+    """Shade the walls. Their pattern begins at the foot, north and east of the start."""
     at0, at1, at2 = F32(camera[0]), F32(camera[1]), F32(camera[2])
-    sun0, sun1, sun_up = light.to_sun[0], light.to_sun[1], -light.to_sun[2]
-    floor_texel = _texels2(floor, pixel2) / max(-at2, F32(MIN_DEPTH_M))
-    walls_texel = _texels2(walls, pixel2)
-    for v in range(len(lines)):
-        d0, d1, d2 = start32(axes, lines[v, 0], lines[v, 1])
-        left, end = _span(ids, v, 0, len(xs), I32(FLOOR), I32(FLOOR))
-        far_row, x_row = far[v, left:end], xs[left:end]
+    sun0, sun1 = light.to_sun[0], light.to_sun[1]
+    texel = _texels2(walls, pixel2)
+    first, last = I32(WALL_NORTH_SOUTH), I32(WALL_EAST_WEST)
+    begin, stop = _span(ids, 0, len(ids), 0, len(ids), first, last)
+    for left in range(begin, stop, BLOCK):
+        end = min(left + BLOCK, stop)
+        seen, depths = ids[left:end], far[left:end]
+        norths, easts, downs = rays.north[left:end], rays.east[left:end], rays.down[left:end]
         for u in range(end - left):
-            x, t = F32(x_row[u]), far_row[u]
-            n, e = d0 + x * r0, d1 + x * r1
-            across = (at1 + t * e) * floor.per_m + floor.offset[0]
-            along = floor.offset[1] - (at0 + t * n) * floor.per_m
-            # The camera's height is t times the ray's slope.
-            points.place[u] = texel_at(across, along, floor_texel * t * t * t)
-            points.facing[u] = sun_up
-            points.up[u] = ONE
-        first, last = I32(FLOOR), I32(FLOOR)
-        paint(out, ids, lit, clear, v, left, end, first, last, points, floor, light, atlas)
-        first, last = I32(WALL_NORTH_SOUTH), I32(WALL_EAST_WEST)
-        left, end = _span(ids, v, 0, len(xs), first, last)
-        far_row, x_row, seen = far[v, left:end], xs[left:end], ids[v, left:end]
-        for u in range(end - left):
-            x, t = F32(x_row[u]), far_row[u]
-            n, e, d = d0 + x * r0, d1 + x * r1, d2 + x * r2
+            t, n, e, d = depths[u], norths[u], easts[u], downs[u]
             north = seen[u] == first
             normal, to_sun = (n if north else e), (sun0 if north else sun1)
             to_sun = -to_sun if normal > ZERO else to_sun
             across = (at1 + t * e if north else at0 + t * n) * walls.per_m + walls.offset[0]
             along = (at2 + t * d) * walls.per_m + walls.offset[1]
-            texels = walls_texel * t * t / max(abs(normal), _STEEP)
+            texels = texel * t * t / max(abs(normal), _STEEP)
             points.place[u] = texel_at(across, along, texels)
             points.facing[u] = max(to_sun, ZERO)
             points.up[u] = ZERO
-        paint(out, ids, lit, clear, v, left, end, first, last, points, walls, light, atlas)
+        paint(out, ids, lit, clear, left, end, first, last, points, walls, light, atlas)
 
 
 @kernel
@@ -226,12 +254,13 @@ def shade_obstacle(
     place, facing, ups, _ = points
     own = I32(OBSTACLE + number)
     for v in range(rectangle[0], rectangle[1]):
-        left, end = _span(ids, v, rectangle[2], rectangle[3], own, own)
+        line = v * len(xs)
+        low, high = line + rectangle[2], line + rectangle[3]
+        left, end = _span(ids, line, line + len(xs), low, high, own, own)
         if end == 0:
             continue
-        x_row = xs[left:end]
+        x_row, far_row = xs[left - line : end - line], far[left:end]
         d0, d1, d2 = start32(pose, lines[v, 0], lines[v, 1])
-        far_row = far[v, left:end]
         if shape == BOX:
             for u in range(end - left):
                 x, t = F32(x_row[u]), far_row[u]
@@ -280,4 +309,4 @@ def shade_obstacle(
                 place[u] = texel_at(across + begin_u, along + begin_v, texels)
                 facing[u] = max(to_sun, ZERO)
                 ups[u] = min(max(-c * per0, -ONE), ONE)
-        paint(out, ids, lit, clear, v, left, end, own, own, points, surface, light, atlas)
+        paint(out, ids, lit, clear, left, end, own, own, points, surface, light, atlas)

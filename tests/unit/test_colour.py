@@ -290,7 +290,7 @@ def test_every_floor_point_is_dark_where_a_way_to_the_sun_is_blocked(
     for seed, (azimuth, elevation) in enumerate([(40.0, 35.0), (200.0, 60.0), (300.0, 20.0)]):
         scene = arena(busy(seed), sun=sun(azimuth, elevation), sky=sky(0.0))
         to_sun, b = scene.look.light.to_sun, scene.bounds
-        for position, attitude in poses(seed, 4):
+        for position, attitude in poses(seed, 2):
             seen = see(scene, position, attitude, k)
             floor = seen.seen == primitives.FLOOR
             p = (np.array(position) + seen.depth_m[..., None] * rays_of(k, attitude))[floor]
@@ -303,7 +303,7 @@ def test_every_floor_point_is_dark_where_a_way_to_the_sun_is_blocked(
             found = seen.rgb[floor][:, 0] == 0
             wrong += int((blocked != found).sum())
             dark_points, total = dark_points + int(found.sum()), total + len(p)
-    assert dark_points > 2000
+    assert dark_points > 1000
     # Ways are sampled every centimetre: grazing ones miss a corner.
     assert wrong < 0.002 * total
 
