@@ -47,6 +47,10 @@ class Finish:
     size_m: Floats  # (m,) `Material.size_m`
     offset: Floats  # (m, 2) where the pattern begins, in its periods, 0..1
 
+    def colour(self, row: int) -> Rgb:
+        """Return the sRGB 0-255 of a surface seen from far away: half of each albedo."""
+        return srgb_bytes(self.albedo[row].mean(axis=0))
+
 
 @dataclass(frozen=True)
 class Light:

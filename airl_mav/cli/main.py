@@ -36,7 +36,7 @@ SUBCOMMANDS: dict[str, str] = {
     "report": "a run's tables and page again, or a comparison of several runs",
     "refit": "vehicle and computer profiles from a recorded flight",
     "refly": "rehearse a flight that was recorded, and compare the two",
-    "render": "an arena as a colour camera sees it, as a picture",
+    "render": "what a colour camera sees: an arena as a picture, a flight as a film",
     "arena": "look at an arena, or at what its profile draws",
     "parameters": "a vehicle's parameters as a file for firmware that you start",
     "conformance": "does a flight controller do what the rehearsal assumes?",

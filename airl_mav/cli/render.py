@@ -1,43 +1,50 @@
-"""`airl render`: a still of an arena as a colour camera sees it."""
+"""`airl render`: an arena as a camera sees it, as a picture, or a recorded flight as a film."""
 
 from __future__ import annotations
 
-import io
 import math
 from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from numpy.typing import NDArray
-from PIL import Image
 from pydantic import Field
 from rich.console import Console
 
 from airl_mav.arena.generate import generate
-from airl_mav.arena.geometry import Arena
-from airl_mav.camera.frame import depth_to_z16
+from airl_mav.black_box.messages import SUFFIX
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.picture import antialiased, grey, render_picture
 from airl_mav.cli.options import POSITIONAL, check_installed
+from airl_mav.cli.recordings import folder_of
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity
-from airl_mav.core.files import replace_file
 from airl_mav.core.frames import quat_from_euler
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.projection import Projection, check_fov
-from airl_mav.report.depth_colours import coloured
-from airl_mav.report.segmentation_colours import coloured_segmentation
-from airl_mav.scenario.model import DEFAULT_ARENA, GREATEST_SEED, ArenaName
-
-Shown = Literal["rgb", "grey", "depth", "segmentation"]
+from airl_mav.rehearsal.run_folder import load
+from airl_mav.report.arenas import trust_arenas
+from airl_mav.report.camera_pictures import FILMS, Shown, film, still, write_film, write_png
+from airl_mav.report.replay.runs import ReplayedRun
+from airl_mav.scenario.model import DEFAULT_ARENA, GREATEST_SEED
 
 SAMPLES = {"raycast": 16, "mitsuba": 64}
 
+FILM_SAMPLES = 4
+
+STILL_PX, FILM_PX = (960, 640), (384, 256)
+
+OF_AN_ARENA = (
+    *("seed", "renderer", "north_m", "east_m", "height_m", "yaw_deg", "pitch_up_deg"),
+    *("time_s", "vehicle_width_m"),
+)
+"""Options that a flight has no use for: it has its own."""
+
+OF_A_FLIGHT = ("flight", "rate_hz", "trust")
+
 
 class RenderOptions(ProfileModel):
-    """Render an arena from a pose, by the ray caster of the cameras or by Mitsuba's path tracer.
+    """Render an arena as a picture, or what the camera of a recorded flight saw as a film.
 
     Without a pose the camera is where the vehicle begins to fly, and looks north.
 
@@ -46,9 +53,17 @@ class RenderOptions(ProfileModel):
         airl render forest.toml --north-m 10 --height-m 3 --yaw-deg 30 --out forest.png
         airl render dense-obstacles --show segmentation --out seen.png
         airl render dense-obstacles --renderer mitsuba --samples 256
+        airl render runs/A 7 --out flight.gif
     """
 
-    arena: Annotated[ArenaName, POSITIONAL] = DEFAULT_ARENA
+    subject: Annotated[str, POSITIONAL] = Field(
+        default=DEFAULT_ARENA,
+        description="arena, a shipped name or a path to a .toml; or a run folder, or the black box"
+        " of a flight (.mcap)",
+    )
+    flight: Annotated[int | None, POSITIONAL] = Field(
+        default=None, description="number of the run's flight; by default the worst"
+    )
     seed: int | None = quantity(
         "seed of the arena; by default the profile's", "1", ge=0, le=GREATEST_SEED, default=None
     )
@@ -59,13 +74,24 @@ class RenderOptions(ProfileModel):
         default="raycast", description="what draws; mitsuba draws rgb alone, without fog"
     )
     samples: int | None = quantity(
-        "rays or paths a pixel; by default 16 of raycast, 64 of mitsuba; a camera has one",
+        "rays or paths a pixel; by default 16, in a film 4, of mitsuba 64; a camera has one",
         "1",
         ge=1,
         le=4096,
         default=None,
     )
-    out: Path = Field(default=Path("render.png"), description="the .png file to write")
+    out: Path | None = Field(
+        default=None,
+        description="the file to write: .png of an arena, .gif or .webp of a flight; by default"
+        " render.png or render.gif",
+    )
+    rate_hz: float = quantity(
+        "pictures a second of a film, rounded to steps of 10 ms", "Hz", ge=1, le=50, default=10.0
+    )
+    trust: bool = Field(
+        default=False,
+        description="run the arena generators that the run names: code of whoever made the folder",
+    )
     north_m: float = quantity(
         "of the camera: distance north of the start", "m", ge=-1000, le=1000, default=0.0
     )
@@ -84,8 +110,12 @@ class RenderOptions(ProfileModel):
     )
     pitch_up_deg: float = quantity("how far the camera looks up", "deg", ge=-90, le=90, default=0.0)
     projection: Projection = Field(default="pinhole", description="of the camera")
-    width_px: int = quantity("width of the picture", "px", ge=8, le=4096, default=960)
-    height_px: int = quantity("height of the picture", "px", ge=6, le=4096, default=640)
+    width_px: int | None = quantity(
+        "width; by default 960, of a film 384", "px", ge=8, le=4096, default=None
+    )
+    height_px: int | None = quantity(
+        "height; by default 640, of a film 256", "px", ge=6, le=4096, default=None
+    )
     fov_deg: float = quantity(
         "horizontal field of view, less than 170 with a pinhole", "deg", gt=10, le=360, default=90.0
     )
@@ -104,61 +134,95 @@ OPTIONS = RenderOptions
 
 
 def run(options: RenderOptions, console: Console | None = None) -> int:
-    """Write the picture. Returns exit status 0.
+    """Write the picture or the film. Returns exit status 0.
 
     Raises:
-        UsageError: The arena cannot be made, the renderer cannot draw it, or the picture not be
-            written there.
+        UsageError: An option does not go with the subject, the arena cannot be made, the run not be
+            read, the renderer cannot draw it, or the file not be written there.
     """
     console = console or Console()
-    if options.out.suffix.lower() != ".png":
-        raise FieldError("out", f"{options.out}", "a file name that ends in .png")
+    path = Path(options.subject)
+    filmed = path.is_dir() or path.suffix == SUFFIX
+    _check(options, filmed)
+    out = options.out or Path("render.gif" if filmed else "render.png")
+    try:
+        told = _film(options, path, out) if filmed else _picture(options, out)
+    except OSError as error:
+        problem = f"cannot write: {error.strerror}"
+        raise FieldError("out", f"{out}", problem=problem) from None
+    console.print(f"{told}: {out}", soft_wrap=True, highlight=False)
+    return 0
+
+
+def _check(options: RenderOptions, filmed: bool) -> None:
+    """Raise FieldError for an option that does not go with the subject or another option."""
+    for name in OF_AN_ARENA if filmed else OF_A_FLIGHT:
+        value = getattr(options, name)
+        if value != RenderOptions.model_fields[name].default:
+            subject = "a flight" if filmed else "an arena"
+            raise FieldError(name, value, problem=f"not for the picture of {subject}")
+    suffixes = FILMS if filmed else (".png",)
+    if options.out is not None and options.out.suffix.lower() not in suffixes:
+        names = " or ".join(suffixes)
+        raise FieldError("out", f"{options.out}", f"a file name that ends in {names}")
     check_fov("fov_deg", options.projection, options.fov_deg)
     if options.renderer == "mitsuba":
         check_installed("render")
         if options.show != "rgb":
             raise FieldError("show", options.show, "rgb with --renderer mitsuba")
-    spec = load_profile("arenas", options.arena, ArenaSpec)
+
+
+def _camera(options: RenderOptions, size: tuple[int, int]) -> Intrinsics:
+    """Return the camera; its size where none is asked for."""
+    width, height = options.width_px or size[0], options.height_px or size[1]
+    return Intrinsics.from_fov(width, height, math.radians(options.fov_deg), options.projection)
+
+
+def _rays(samples: int) -> int:
+    """Return the rays of a pixel, each way, for so many of them."""
+    return math.ceil(math.sqrt(samples))
+
+
+def _picture(options: RenderOptions, out: Path) -> str:
+    """Write the picture of an arena; return what was written."""
+    spec = load_profile("arenas", options.subject, ArenaSpec)
     arena = generate(
         spec,
         spec.default_seed if options.seed is None else options.seed,
-        name=Path(options.arena).stem,
+        name=Path(options.subject).stem,
         vehicle_width_m=options.vehicle_width_m,
     )
     height = spec.flight_altitude_m if options.height_m is None else options.height_m
-    pixels = _picture(arena, options, np.array([options.north_m, options.east_m, -height]))
-    written = io.BytesIO()
-    Image.fromarray(pixels).save(written, "PNG")
-    try:
-        replace_file(options.out, written.getvalue())
-    except OSError as error:
-        problem = f"cannot write: {error.strerror}"
-        raise FieldError("out", f"{options.out}", problem=problem) from None
-    console.print(f"picture: {options.out}", soft_wrap=True, highlight=False)
-    return 0
-
-
-def _picture(
-    arena: Arena, options: RenderOptions, position: NDArray[np.float64]
-) -> NDArray[np.uint8]:
-    """Return the picture, (h, w) or (h, w, 3), from a position (3,) NED [m]."""
-    attitude = quat_from_euler(
-        0.0, math.radians(options.pitch_up_deg), math.radians(options.yaw_deg)
-    )
-    camera = Intrinsics.from_fov(
-        options.width_px, options.height_px, math.radians(options.fov_deg), options.projection
-    )
-    pose = (arena, arena.centers_at(round(options.time_s * US_PER_S)), camera, position, attitude)
+    position = np.array([options.north_m, options.east_m, -height])
+    pitch, yaw = math.radians(options.pitch_up_deg), math.radians(options.yaw_deg)
+    centers = arena.centers_at(round(options.time_s * US_PER_S))
+    camera = _camera(options, STILL_PX)
+    pose = (arena, centers, camera, position, quat_from_euler(0.0, pitch, yaw))
     samples = options.samples or SAMPLES[options.renderer]
     if options.renderer == "mitsuba":
         # Imported here: what it draws with is an extra.
         from airl_mav.camera.mitsuba import path_traced
 
-        return path_traced(*pose, samples=samples)
-    if options.show in ("rgb", "grey"):
-        rgb = antialiased(*pose, math.ceil(math.sqrt(samples)))
-        return rgb if options.show == "rgb" else grey(rgb)
-    picture = render_picture(*pose)
-    if options.show == "depth":
-        return coloured(depth_to_z16(picture.depth_m), options.range_m)
-    return coloured_segmentation(picture.seen)
+        write_png(out, path_traced(*pose, samples=samples))
+    else:
+        rays = _rays(samples)
+        write_png(out, still(*pose, options.show, rays=rays, range_m=options.range_m))
+    return "picture"
+
+
+def _film(options: RenderOptions, path: Path, out: Path) -> str:
+    """Write the film of a flight; return what was written."""
+    folder = folder_of(path)
+    if options.trust:
+        trust_arenas(load(folder))
+    run = ReplayedRun(folder)
+    record = run.records[0] if options.flight is None else run.record(options.flight)
+    pictures = film(
+        run.flight(record),
+        _camera(options, FILM_PX),
+        options.show,
+        rate_hz=options.rate_hz,
+        rays=_rays(options.samples or FILM_SAMPLES),
+        range_m=options.range_m,
+    )
+    return f"film of flight {record.index}, {write_film(out, pictures, options.rate_hz)} pictures"

@@ -13,6 +13,7 @@ import numpy as np
 import viser
 from numpy.typing import NDArray
 
+from airl_mav.arena.appearance import OBSTACLE
 from airl_mav.arena.geometry import Arena, Bounds, Shape
 from airl_mav.core.frames import (
     FRD_FROM_OPTICAL,
@@ -38,7 +39,6 @@ from airl_mav.view.look import (
     OPEN,
     SECTION,
     START,
-    STILL,
     WALL_OPACITY,
     Look,
 )
@@ -167,7 +167,8 @@ class FlightScene:
         )
         for i in range(len(arena.obstacles)):
             moves = i >= arena.n_static
-            node = self._obstacle(arena, i, MOVING if moves else STILL)
+            colour = MOVING if moves else arena.look.finish.colour(OBSTACLE + i)
+            node = self._obstacle(arena, i, colour)
             if moves:
                 self._movers.append(node)
 

@@ -95,6 +95,7 @@ def test_mitsuba_draws_the_same_view(tmp_path: Path) -> None:
     ("words", "message"),
     [
         (("no-such",), "no arena profile 'no-such'"),
+        (("--rate-hz", "5"), "--rate-hz 5: not for the picture of an arena"),
         (("--fov-deg", "175"), "--fov-deg 175: accepted: value < 170 deg"),
         (("--height-m", "-1"), "--height-m -1: accepted: 0 <= value <= 1000 m"),
         (("--samples", "0"), "--samples 0: accepted: 1 <= value <= 4096"),

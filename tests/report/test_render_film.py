@@ -1,0 +1,98 @@
+"""`airl render RUN`: what the camera of a recorded flight saw, as a film."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image, ImageSequence
+from rich.console import Console
+
+from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.picture import render_picture
+from airl_mav.camera.render import camera_pose
+from airl_mav.cli.options import carry_out
+from airl_mav.core.errors import UsageError
+from airl_mav.report.camera_pictures import film
+from airl_mav.report.forensics.camera_view import PolicyCamera
+from airl_mav.report.replay.runs import ReplayedRun
+from tests.support.run_demo import write_demo_run
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    written, _ = write_demo_run(
+        tmp_path_factory.mktemp("film") / "run", episodes=2, profile="dynamic-obstacles"
+    )
+    return written.path
+
+
+def render(*words: str) -> None:
+    code = carry_out("airl render", "airl_mav.cli.render", list(words), console=Console(quiet=True))
+    assert code == 0
+
+
+def load(frame: Image.Image) -> bool:
+    """Load a picture: only then its duration is known."""
+    frame.load()
+    return True
+
+
+def test_pictures_are_what_the_vehicles_camera_saw(folder: Path) -> None:
+    """The last sample of the recording, posed by hand."""
+    run = ReplayedRun(folder)
+    flight = run.flight(run.record(1))
+    camera = Intrinsics.from_fov(64, 48, 1.5)
+    pictures = list(film(flight, camera, "rgb", rate_hz=50.0, rays=1, range_m=20.0))
+    path, record = flight.path, flight.record
+    assert record.navigation_us is not None
+    seconds = (int(path.time_us[-1]) - record.navigation_us) / 1e6
+    assert len(pictures) == int(seconds * 50.0) + 1
+    # The recording is at 50 Hz, too: its samples are the film's, from navigation on.
+    at = int(np.searchsorted(path.time_us, record.navigation_us)) + 10
+    time_us = record.navigation_us + 10 * 20_000
+    assert path.time_us[at] == time_us
+    mount = PolicyCamera.of(flight.vehicle.camera).mount
+    place, attitude = camera_pose(path.position[at], path.quaternion[at], mount)
+    assert flight.arena is not None
+    centers = flight.arena.centers_at(time_us - record.started_us)
+    expected = render_picture(
+        flight.arena, centers, camera, np.array(place), np.array(attitude)
+    ).rgb
+    assert (pictures[10] == expected).mean() > 0.999
+
+
+@pytest.mark.parametrize("suffix", [".gif", ".webp"])
+def test_a_film_has_every_picture_for_its_time(folder: Path, tmp_path: Path, suffix: str) -> None:
+    out = tmp_path / f"flight{suffix}"
+    words = ("--rate-hz", "2", "--width-px", "48", "--height-px", "32", "--out", str(out))
+    render(str(folder), "1", *words)
+    run = ReplayedRun(folder)
+    flight = run.flight(run.record(1))
+    assert flight.record.navigation_us is not None
+    seconds = (int(flight.path.time_us[-1]) - flight.record.navigation_us) / 1e6
+    with Image.open(out) as image:
+        assert image.size == (48, 32)
+        times = [frame.info["duration"] for frame in ImageSequence.Iterator(image) if load(frame)]
+    # Writers merge pictures that are alike.
+    assert sum(times) == pytest.approx(500 * (int(2 * seconds) + 1), abs=1)
+    assert len(times) > 2
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--seed", "3"), "--seed 3: not for the picture of a flight"),
+        (("--renderer", "mitsuba"), "--renderer mitsuba: not for the picture of a flight"),
+        (("7",), "0 to 1, as far as recorded"),
+        (("--out", "x.png"), "accepted: a file name that ends in .gif or .webp"),
+    ],
+)
+def test_what_does_not_go_with_a_flight_is_one_line(
+    folder: Path, words: tuple[str, ...], message: str
+) -> None:
+    with pytest.raises(UsageError) as caught:
+        render(str(folder), *words)
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
