@@ -15,6 +15,9 @@ LOW_THRUST = 0.3
 # Thrust this close to hover, going up: it flies.
 LIFT_THRUST = 0.95
 LIFT_SPEED_M_S = 0.15
+# So fast it flies at any thrust, as multiples of LNDMC_Z_VEL_MAX: PX4's bound for vertical movement
+# right after take-off, wider than later so that what motors do to sensors is not taken for one.
+LIFTED_SPEED = 2.5
 
 
 class LandDetector:
@@ -39,10 +42,16 @@ class LandDetector:
         return time_us - self._still_since_us >= self._value("LNDMC_TRIG_TIME") * US_PER_S
 
     def lifted(self, state: Vector, thrust: float) -> bool:
-        """Return whether a standing vehicle has left the floor."""
+        """Return whether a standing vehicle has left the floor.
+
+        MPC_THR_HOVER may be wrong: one that is lighter than it says climbs at less thrust.
+        """
         self._still_since_us = None
-        climbing = state.item(V + 2) < -LIFT_SPEED_M_S
-        return climbing and thrust > LIFT_THRUST * self._value("MPC_THR_HOVER")
+        climb_m_s = -state.item(V + 2)
+        if climb_m_s > LIFTED_SPEED * self._value("LNDMC_Z_VEL_MAX"):
+            return True
+        hovers = thrust > LIFT_THRUST * self._value("MPC_THR_HOVER")
+        return climb_m_s > LIFT_SPEED_M_S and hovers
 
     def _carried(self, thrust: float) -> bool:
         low = self._value("MPC_THR_MIN")

@@ -12,7 +12,7 @@ from firmware_sim.autopilot.autopilot_state import Arming, Mode, Result, Setpoin
 from firmware_sim.autopilot.commander import Phase
 from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.streams.status import heartbeat
-from tests.support.flight_rig import NAN, Rig, flight, velocity_setpoint
+from tests.support.flight_rig import NAN, Rig, flight, quad, velocity_setpoint
 
 STILL = velocity_setpoint(0.0, 0.0, 0.0)
 
@@ -55,6 +55,22 @@ def test_a_late_take_off_is_not_cut_short() -> None:
         rig.ap.takeoff(2.0)
         rig.until(lambda: rig.mode is Mode.HOLD, 12.0)
         rig.until(lambda: rig.height > 1.5, 6.0)
+
+
+@pytest.mark.parametrize("share", [0.5, 0.65, 0.8, 1.25, 1.45])
+def test_a_vehicle_of_another_weight_than_its_parameters_say(share: float) -> None:
+    """MPC_THR_HOVER is that of the profile; the true one is this share of it."""
+    body = quad().body
+    wrong = {"mass_kg": share * body.mass_kg}
+    with flight(0, vehicle=quad(body=wrong)) as rig:
+        rig.arm()
+        rig.ap.takeoff(2.5)
+        rig.until(lambda: rig.mode is Mode.HOLD, 15.0)
+        rig.run(5.0)
+        assert abs(rig.height - 2.5) < 0.4
+        assert rig.ap.set_mode(Mode.LAND) is Result.ACCEPTED
+        rig.until(lambda: disarmed(rig), 20.0)
+        assert rig.height < 0.01
 
 
 def test_taking_off_right_after_landing() -> None:
