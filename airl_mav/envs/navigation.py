@@ -9,27 +9,23 @@ as well. Everything is in ticks of simulated time, so nothing depends on the mac
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.generate import generate
-from airl_mav.arena.geometry import Arena
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.constants import TICK_US, US_PER_MS, US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.core.streams import Stream, stream
-from airl_mav.envs.arenas import ArenaBatch, batch_of, move_all_obstacles, put_arena, with_room
+from airl_mav.envs.arenas import ArenaBatch, move_all_obstacles
 from airl_mav.envs.cameras import Cameras
 from airl_mav.envs.companions import Companions
-from airl_mav.envs.curriculum import check_stage, stages_of
 from airl_mav.envs.delay import injections_of
 from airl_mav.envs.draws import DelayDraws
 from airl_mav.envs.encoding import shrink
+from airl_mav.envs.episode_arenas import EpisodeArenas
 from airl_mav.envs.estimation import Telemetry
 from airl_mav.envs.faults import later_us, twin_faults
 from airl_mav.envs.fleet import Fleet, Rules, Vehicle, Verdict, hover, new_fleet, vehicle_of
@@ -136,7 +132,6 @@ class Navigation(Stateful):
             computer_w = computer.onboard_watts
         self.vehicle: VehicleProfile = vehicle
         self.arena_spec: ArenaSpec = arena or load_profile("arenas", spec.arena, ArenaSpec)
-        self.stages = stages_of(spec.curriculum, self.arena_spec)
         self.camera: Camera = spec.camera.of(self.vehicle.camera)
         self.observation = ObservationSpec(
             layout=spec.layout,
@@ -152,7 +147,6 @@ class Navigation(Stateful):
         if problem := camera_mismatch(self.observation, self.intrinsics):
             raise UsageError(f"image_width_px, image_height_px: {problem}")
         self.injections = injections_of(spec.delay) if injection is None else (injection,)
-        self._arena_seed = arena_seed
         self._trace = trace
         parameters = flown_values(self.vehicle.autopilot_parameters())
         self._vehicle = vehicle_of(self.vehicle, parameters.__getitem__, computer_w)
@@ -164,14 +158,12 @@ class Navigation(Stateful):
         self._link_us = round(spec.delay.link_ms * US_PER_MS)
         hover_s = rules.hover_after_s
         self._hover_us = None if hover_s is None else round(hover_s * US_PER_S)
-        self.arenas: list[Arena | None] = [None] * n
-        self._ahead: dict[tuple[int, int | None], Arena] = {}
-        """Arenas that were made ahead, by seed and zone."""
-        self.seeds = np.zeros(n, np.int64)
-        self.zones = np.full(n, -1, np.int64)
-        self._begun = np.zeros(n, np.bool_)
+        self._places = EpisodeArenas(
+            spec, self.arena_spec, n, self.vehicle.body.width_m, arena_seed
+        )
+        self.stages, self.arenas = self._places.stages, self._places.present
+        self.seeds, self.zones = self._places.seeds, self._places.zones
         self.fleet = new_fleet(n)
-        self._batch = batch_of([])
         self._decision = np.zeros(n, np.int64)
         self._extra_us = np.zeros(n, np.int64)
         self._delays = DelayDraws(
@@ -213,7 +205,7 @@ class Navigation(Stateful):
         Raises:
             UsageError: No arena can be made of a seed, or there is no such zone.
         """
-        check_stage(self.stages, self.arena_spec, zone)
+        self._places.check_zone(zone)
         who = np.zeros(self.n, np.bool_)
         for i, seed in zip(slots, seeds, strict=True):
             self._begin(i, int(seed), zone)
@@ -222,34 +214,15 @@ class Navigation(Stateful):
         self._look_ahead(who)
 
     def prepare(self, seeds: Sequence[int], zone: int | None = None) -> None:
-        """Make the arenas of episodes that are likely to begin soon, of no others from now on.
-
-        It changes nothing but the time that `begin` takes. One after the other they take half as
-        long as one at a time between two steps, each of which empties the processor's caches.
-        """
-        self._ahead.clear()
-        for seed in seeds:
-            # One that cannot be made is an error where its episode begins.
-            with suppress(UsageError):
-                self._ahead[seed, zone] = self._arena(seed, zone)
+        """Make the arenas of episodes that are likely to begin soon; see `EpisodeArenas`."""
+        self._places.prepare(seeds, zone)
 
     def prepared(self, seeds: Sequence[int], zone: int | None = None) -> bool:
         """Return whether all of these arenas have been made ahead."""
-        return all((seed, zone) in self._ahead for seed in seeds)
+        return self._places.prepared(seeds, zone)
 
     def _begin(self, i: int, seed: int, zone: int | None) -> None:
-        arena = self._ahead.pop((seed, zone), None) or self._arena(seed, zone)
-        self.arenas[i], self._begun[i] = arena, True
-        self.seeds[i], self.zones[i] = seed, -1 if zone is None else zone
-        if len(self._batch.bounds) == 0:
-            # The others stay in the first one's until their own begin.
-            self._batch = batch_of([arena] * self.n)
-        try:
-            put_arena(self._batch, i, arena)
-        except ValueError:
-            # It is larger than all before.
-            self._batch = with_room(self._batch, arena)
-            put_arena(self._batch, i, arena)
+        self._places.begin(i, seed, zone)
         randomisation = self.spec.randomisation
         airframe = self._vehicle.airframe
         if spreads(randomisation):
@@ -281,7 +254,7 @@ class Navigation(Stateful):
             image, state = known.foreseen(rows)
         else:
             image, state = self.cameras.image[rows], self.kinematics(rows)
-        goal = self._batch.goal[rows]
+        goal = self._places.batch.goal[rows]
         return observe(
             image, self.intrinsics, state, goal, known.told(rows), known.earlier_mm(rows)
         )
@@ -300,7 +273,7 @@ class Navigation(Stateful):
     def flights(self) -> Flights:
         """Return the status of all flights."""
         fleet = self.fleet
-        to_goal = self._batch.goal - fleet.position[:, :2]
+        to_goal = self._places.batch.goal - fleet.position[:, :2]
         return Flights(
             verdict=fleet.verdict.copy(),
             time_s=fleet.time_us / US_PER_S,
@@ -320,7 +293,7 @@ class Navigation(Stateful):
 
     def whole_truth(self) -> WholeTruth:
         """Return all that the twin knows, the very arrays that it flies on: to look at only."""
-        return WholeTruth(self.fleet, self._batch, self._vehicle)
+        return WholeTruth(self.fleet, self._places.batch, self._vehicle)
 
     def fly(self, commands: NDArray[np.float64]) -> None:
         """Fly one decision of every flight that has not ended.
@@ -366,7 +339,7 @@ class Navigation(Stateful):
             "navigation": {
                 "seeds": self.seeds,
                 "zones": self.zones,
-                "begun": self._begun,
+                "begun": self._places.begun,
                 "decision": self._decision,
                 "extra_us": self._extra_us,
             },
@@ -391,24 +364,8 @@ class Navigation(Stateful):
             UsageError: It is not one of this environment.
         """
         super().set_state(state)
-        self.arenas = [
-            self._arena(int(seed), None if zone < 0 else int(zone)) if begun else None
-            for seed, zone, begun in zip(self.seeds, self.zones, self._begun, strict=True)
-        ]
-        spare = next((arena for arena in self.arenas if arena is not None), None)
-        room = [spare if arena is None else arena for arena in self.arenas]
-        self._batch = batch_of([arena for arena in room if arena is not None])
+        self._places.restore()
         self.fleet.room[:] = 0.0
-
-    def _arena(self, seed: int, zone: int | None) -> Arena:
-        stage = None if zone is None else self.stages[zone]
-        return generate(
-            self.arena_spec if stage is None else stage.arena,
-            seed if self._arena_seed is None else self._arena_seed,
-            name=Path(self.spec.arena).stem,
-            vehicle_width_m=self.vehicle.body.width_m,
-            zone=None if stage is None else stage.zone,
-        )
 
     def holding_altitude(self) -> NDArray[np.float64]:
         """Return the downward speeds (n,) [m/s] that hold the altitude."""
@@ -421,7 +378,7 @@ class Navigation(Stateful):
         while to_freeze is not None and (to_freeze <= ticks).any():
             part = np.minimum(ticks, to_freeze)
             self._advance(part)
-            self.cameras.freeze(self.fleet, self._batch, self.seeds)
+            self.cameras.freeze(self.fleet, self._places.batch, self.seeds)
             ticks = ticks - part
             to_freeze = self.cameras.ticks_to_freeze(self.fleet.time_us)
         self._advance(ticks)
@@ -441,13 +398,15 @@ class Navigation(Stateful):
             fleet.position.copy(),
             fleet.quaternion.copy(),
         )
-        advance(fleet, self._batch, ticks.sum(axis=1), self._vehicle, self._rules, None, legs)
+        advance(
+            fleet, self._places.batch, ticks.sum(axis=1), self._vehicle, self._rules, None, legs
+        )
         seen = fleet._replace(
             time_us=legs.seen_us, position=legs.seen_position, quaternion=legs.seen_quaternion
         )
         everyone = np.ones(self.n, np.bool_)
-        self.cameras.capture(seen, self._batch, everyone, self.seeds)
-        move_all_obstacles(self._batch, fleet.time_us)
+        self.cameras.capture(seen, self._places.batch, everyone, self.seeds)
+        move_all_obstacles(self._places.batch, fleet.time_us)
         return True
 
     def _advance(self, ticks: NDArray[np.int64]) -> None:
@@ -460,7 +419,7 @@ class Navigation(Stateful):
 
     def _fly(self, ticks: NDArray[np.int64]) -> None:
         def fly(ticks: NDArray[np.int64], air: NDArray[np.float64] | None) -> None:
-            advance(self.fleet, self._batch, ticks, self._vehicle, self._rules, air)
+            advance(self.fleet, self._places.batch, ticks, self._vehicle, self._rules, air)
 
         self._winds.fly(self.fleet, ticks, fly)
 
@@ -469,5 +428,5 @@ class Navigation(Stateful):
         if self._trace is not None:
             self._trace.captured(self.fleet, who)
         if (self.fleet.time_us[who] == 0).any():
-            self.cameras.freeze(self.fleet, self._batch, self.seeds)
-        self.cameras.capture(self.fleet, self._batch, who, self.seeds)
+            self.cameras.freeze(self.fleet, self._places.batch, self.seeds)
+        self.cameras.capture(self.fleet, self._places.batch, who, self.seeds)
