@@ -73,7 +73,8 @@ def _bricks(row: NDArray[np.intp], column: NDArray[np.intp]) -> Floats:
     height, length = SIDE // COURSES, SIDE // int(PERIOD["brick"])
     course = row // height
     along = column + (course % 2) * (length // 2)
-    tone = np.random.default_rng(3).uniform(0.75, 1.0, (COURSES, int(PERIOD["brick"])))
+    rng = np.random.default_rng(3)
+    tone = rng.uniform(0.75, 1.0, (COURSES, int(PERIOD["brick"])))
     brick = tone[course, (along % SIDE) // length]
     joint = (row % height < _JOINT) | (along % length < _JOINT)
     return np.where(joint, 0.0, brick)

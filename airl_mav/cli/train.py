@@ -22,7 +22,7 @@ from airl_mav.training.progress import Exported, TrainingBar
 from airl_mav.training.request import TrainRequest
 
 if TYPE_CHECKING:
-    from airl_mav.experiments.live import ViewRequest
+    from airl_mav.view.ends import ViewRequest
     from airl_mav.view.viewer import Viewer
 
 

@@ -7,8 +7,8 @@ from pydantic import Field
 from airl_mav.cli.options import check_installed
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity
-from airl_mav.experiments.live import ViewRequest
 from airl_mav.scenario.aircraft import GREATEST_PORT
+from airl_mav.view.ends import ViewRequest
 
 
 class Viewing(ProfileModel):

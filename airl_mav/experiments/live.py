@@ -23,18 +23,10 @@ from airl_mav.rehearsal.rehearsal import Rehearsal, RehearsalError
 from airl_mav.rehearsal.run_folder import RUN_FILE, open_folder
 from airl_mav.rehearsal.signals import terminated_as_interrupted
 from airl_mav.scenario.resolved import ResolvedScenario
-from airl_mav.view.ends import ViewEnds
+from airl_mav.view.ends import ViewEnds, ViewRequest
 from firmware_sim.external.programs import check_program
 
 Ended = Literal["complete", "interrupted", "broken off"]
-
-
-@dataclass(frozen=True)
-class ViewRequest:
-    """That flights are to be watched while they fly."""
-
-    port: int | None = None
-    """TCP port of the page; None: any free one."""
 
 
 EXIT_CODES: dict[Ended, int] = {

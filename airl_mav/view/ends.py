@@ -1,8 +1,18 @@
-"""Where a view is reached. Light: who is not watched imports nothing else of this room."""
+"""That a view is asked for, and where it is reached. Light: who is not watched imports no more."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from pydantic import BaseModel, ConfigDict
+
+
+@dataclass(frozen=True)
+class ViewRequest:
+    """That flights are to be watched while they fly."""
+
+    port: int | None = None
+    """TCP port of the page; None: any free one."""
 
 
 class ViewEnds(BaseModel):
