@@ -23,6 +23,27 @@ from companion.cameras.fitting import Fitting, Lens
 READ_S = 0.1
 """A driver is asked for its next image for this long at a time [s], so that it can be closed."""
 
+FAILED_S = 5.0
+"""A camera that delivers nothing for so long has failed [s of waiting]."""
+
+
+class Silence:
+    """How long a driver has waited for its next image."""
+
+    def __init__(self) -> None:
+        """Begin with none."""
+        self._waited_s = 0.0
+
+    def broken(self) -> None:
+        """An image has come."""
+        self._waited_s = 0.0
+
+    def lasted(self, waited_s: float) -> None:
+        """None came in this time [s]. Raises RuntimeError when that makes 5 s."""
+        self._waited_s += waited_s
+        if self._waited_s >= FAILED_S:
+            raise RuntimeError(f"no image for {FAILED_S:g} s")
+
 
 class DepthImage(NamedTuple):
     """One image of a camera, as its driver returns it."""

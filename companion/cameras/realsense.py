@@ -16,7 +16,7 @@ from airl_mav.camera.frame import MAX_MM, MM_PER_M
 from airl_mav.core.clock import utc_us
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.errors import FieldError
-from companion.cameras.driver import DepthImage
+from companion.cameras.driver import DepthImage, Silence
 from companion.cameras.fitting import Lens
 
 RATE_HZ = 30
@@ -26,9 +26,6 @@ best performance")."""
 
 RECORDINGS = ".bag", ".db3"
 """Files of librealsense's recorder, by its version."""
-
-FAILED_S = 5.0
-"""A camera that delivers nothing for so long has failed [s of waiting]."""
 
 
 class RealSense:
@@ -49,7 +46,7 @@ class RealSense:
         k = profile.as_video_stream_profile().intrinsics
         self._lens = Lens(k.width, k.height, k.fx, k.fy, k.ppx, k.ppy)
         self._queue = rs.frame_queue(1)
-        self._silent_s = 0.0
+        self._silence = Silence()
         self._sensor.open(profile)
         self._sensor.start(self._queue)
 
@@ -66,11 +63,9 @@ class RealSense:
         """
         arrived, frame = self._queue.try_wait_for_frame(int(timeout_s * US_PER_S / US_PER_MS))
         if not arrived:
-            self._silent_s += timeout_s
-            if self._silent_s >= FAILED_S:
-                raise RuntimeError(f"no image for {FAILED_S:g} s")
+            self._silence.lasted(timeout_s)
             return None
-        self._silent_s = 0.0
+        self._silence.broken()
         depth = frame.as_depth_frame()
         # Copied: librealsense reuses the memory once the frame is gone.
         image = np.array(depth.get_data(), np.uint16)

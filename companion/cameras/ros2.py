@@ -23,16 +23,13 @@ from rosbags.typesys import Stores, get_typestore
 
 from airl_mav.core.clock import utc_us
 from airl_mav.core.errors import FieldError, UsageError
-from companion.cameras.driver import DepthImage
+from companion.cameras.driver import DepthImage, Silence
 from companion.cameras.fitting import Lens
 from companion.cameras.ros_images import CAMERA_INFO, IMAGE, age_us, depth_mm, info_topic, lens_of
 
 DESCRIBED_S = 5.0
 """A camera whose description has not come by then is not there [s]. ROS 2 nodes find each other
 within a second."""
-
-FAILED_S = 5.0
-"""A camera that sends nothing for so long has failed [s of waiting]."""
 
 MOST_DOMAIN = 232
 """The greatest ROS_DOMAIN_ID: the ports of a greater one do not exist."""
@@ -141,7 +138,7 @@ class Ros2Camera:
         Raises:
             FieldError: Nobody describes the camera, or it is no pinhole.
         """
-        self._utc_now_us, self._silent_s = utc_now_us, 0.0
+        self._utc_now_us, self._silence = utc_now_us, Silence()
         self._participant = _participant()
         described = info_topic(topic)
         about = self._reader(described, CameraInfo)
@@ -177,11 +174,9 @@ class Ros2Camera:
         """
         message = _next(self._images, timeout_s)
         if message is None:
-            self._silent_s += timeout_s
-            if self._silent_s >= FAILED_S:
-                raise RuntimeError(f"no image for {FAILED_S:g} s")
+            self._silence.lasted(timeout_s)
             return None
-        self._silent_s = 0.0
+        self._silence.broken()
         return DepthImage(depth_mm(message), age_us(message, self._utc_now_us()))
 
     def close(self) -> None:

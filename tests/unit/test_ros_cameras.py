@@ -198,6 +198,28 @@ def test_a_topic_of_another_process_is_a_camera(topic: str) -> None:
         camera.close()
 
 
+def test_a_topic_that_falls_silent_has_failed(topic: str) -> None:
+    from companion.cameras import ros2
+
+    camera = ros2.Ros2Camera(topic)
+    heard, silent = camera._images, camera._reader("/nobody/image", ros2.Image)
+    try:
+        camera._images = silent
+        for _ in range(4):
+            camera._silence.lasted(1.2)
+        camera._images = heard
+        while camera.read(1.0) is None:
+            pass
+        # An image ends the silence: the next seconds begin anew.
+        camera._images = silent
+        assert camera.read(0.01) is None
+        camera._silence.lasted(4.9)
+        with pytest.raises(RuntimeError, match="no image for 5 s"):
+            camera.read(0.2)
+    finally:
+        camera.close()
+
+
 def test_a_topic_that_nobody_describes_is_one_line(
     domain: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
