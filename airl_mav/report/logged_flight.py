@@ -17,13 +17,8 @@ from airl_mav.black_box.reading import BlackBox
 from airl_mav.core.constants import US_PER_MS
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.rehearsal.run_folder import FlownEpisode
-from airl_mav.report.recorded_flight import (
-    MOTOR_OUTPUTS,
-    MOTOR_TIMES,
-    episode_of,
-    path_of,
-    stamps_of,
-)
+from airl_mav.report.recorded_flight import episode_of, path_of, stamps_of
+from airl_mav.report.tracking import MOTOR_OUTPUTS, MOTOR_TIMES
 from airl_mav.vehicle_log.alignment import Alignment, align
 from airl_mav.vehicle_log.ulog import VehicleLog
 

@@ -38,9 +38,6 @@ NAVIGATING = "navigating"
 LEAST_NORM = 0.5
 """A quaternion shorter than this says nothing."""
 
-MOTOR_TIMES, MOTOR_OUTPUTS = "motors/time_us", "motors/output"
-"""Columns of a flight with the vehicle's log: (n,) [µs] and (n, 4), 0 to 1, in PX4's order."""
-
 DIGEST = "recording_sha256"
 """Setting of the run that tells which file it was made of."""
 

@@ -15,9 +15,11 @@ from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report.forensics.worst import flown_path
-from airl_mav.report.recorded_flight import MOTOR_OUTPUTS, MOTOR_TIMES
 
 Floats = NDArray[np.float64]
+
+MOTOR_TIMES, MOTOR_OUTPUTS = "motors/time_us", "motors/output"
+"""Columns of a flight with the vehicle's log: (n,) [µs] and (n, 4), 0 to 1, in PX4's order."""
 
 
 @dataclass(frozen=True)
