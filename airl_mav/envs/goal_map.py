@@ -60,6 +60,8 @@ class Body(NamedTuple):
     """Height that it holds [m]."""
     top_speed: float
     """Of the action set [m/s]."""
+    arrived: float
+    """How near the goal it has arrived [m]."""
 
 
 def map_of(batch: ArenaBatch, i: int, body: Body) -> Map:

@@ -58,7 +58,8 @@ def flown_by(name: ExpertName, seeds: Sequence[int], **knobs: Any) -> list[Episo
     ("arena", "actions", "least"),
     [
         ("static-obstacles", "arc-25", 0.97),
-        ("dynamic-obstacles", "velocity", 0.9),
+        ("dynamic-obstacles", "velocity", 0.97),
+        ("crowded", "velocity", 0.95),
     ],
 )
 def test_the_planner_is_safer_and_faster_than_what_it_teaches(
@@ -88,7 +89,7 @@ def test_the_map_is_the_way_around() -> None:
     """Without obstacles the time to go is the distance; behind one it is longer, never inside."""
     free = Navigation(spec_of(None, SMALL | {"arena": "open-field"}), 1)
     free.begin([0], [3])
-    arenas, body = free.whole_truth().arenas, Body(0.3, 0.1, 2.5, 5.0)
+    arenas, body = free.whole_truth().arenas, Body(0.3, 0.1, 2.5, 5.0, 3.0)
     known = map_of(arenas, 0, body)
     rows, columns = np.indices(known.gap.shape)
     north, east = known.north + rows * known.cell, known.east + columns * known.cell
