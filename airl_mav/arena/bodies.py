@@ -33,7 +33,8 @@ class Bodies:
 
     def at(self, places: Floats) -> Obstacles:
         """Return obstacles that stand at `places` (n, 2) north, east [m]."""
-        center = np.column_stack([places, -self.center_height])
+        center = np.empty((len(self), 3))
+        center[:, :2], center[:, 2] = places, -self.center_height
         return Obstacles(self.shape, center, self.half_size, self.yaw)
 
 
@@ -53,8 +54,8 @@ def draw_bodies(
         numbers, shape, kind.half_width_m, kind.height_m, altitude_m, half_size, yaw, center_height
     )
     half = bounding_half(shape, half_size, yaw)
-    order = np.argsort(-np.maximum(half[:, 0], half[:, 1]), kind="stable")
-    return Bodies(shape[order], half_size[order], yaw[order], center_height[order], half[order])
+    _widest_first(shape, half_size, yaw, center_height, half)
+    return Bodies(shape, half_size, yaw, center_height, half)
 
 
 @kernel
@@ -95,6 +96,28 @@ def _size(
             offset = -SPHERE_OFFSET + 2.0 * SPHERE_OFFSET * numbers[4 * n + i]
             half_size[i, 2] = radius
             center_height[i] = max(radius, altitude_m + offset * radius)
+
+
+@kernel
+def _widest_first(
+    shape: NDArray[np.int8], half_size: Floats, yaw: Floats, center_height: Floats, half: Floats
+) -> None:
+    """Sort the fields of `Bodies` by their widest side, equal ones as they are.
+
+    By insertion: there are few, and numpy takes longer to begin with them.
+    """
+    for i in range(1, len(shape)):
+        j = i
+        while j > 0 and max(half[j, 0], half[j, 1]) > max(half[j - 1, 0], half[j - 1, 1]):
+            k = j - 1
+            shape[j], shape[k] = shape[k], shape[j]
+            yaw[j], yaw[k] = yaw[k], yaw[j]
+            center_height[j], center_height[k] = center_height[k], center_height[j]
+            for axis in range(3):
+                half_size[j, axis], half_size[k, axis] = half_size[k, axis], half_size[j, axis]
+            for axis in range(2):
+                half[j, axis], half[k, axis] = half[k, axis], half[j, axis]
+            j = k
 
 
 @lru_cache

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import cached_property
 
 import numpy as np
 
@@ -44,7 +45,7 @@ class _Request:
     ring_m: tuple[float, float]
     vehicle_width_m: float
 
-    @property
+    @cached_property
     def start_box(self) -> Boxes:
         """What obstacles leave free around the start."""
         return _around(np.zeros(2), self.spec.start.clearance_m)
@@ -214,12 +215,15 @@ def _draw_moving(
     spec, (_, n) = request.spec, request.counts
     bodies = draw_bodies(rng, n, spec.moving, spec.flight_altitude_m)
     gap, walking_gap = spec.min_clearance_m, spec.moving.clearance_m
-    start = request.start_box
+    on_the_way = join(request.start_box, standing.grown(walking_gap))
+    at_first = on_the_way
+    if gap > walking_gap:
+        at_first = join(request.start_box, standing.grown(gap))
     tours = draw_tours(
         rng,
         bodies.bounding_half,
-        join(start, standing.grown(max(gap, walking_gap))),
-        join(start, standing.grown(walking_gap)),
+        at_first,
+        on_the_way,
         request.bounds,
         gap,
         spec.moving,

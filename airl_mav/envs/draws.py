@@ -83,7 +83,12 @@ class DelayDraws(DrawnAhead):
             chosen = stream(seed, Stream.SOURCE).integers(len(self._injections))
             injection = self._injections[int(chosen)]
         self._seeds[i], self._blocks[i] = seed, 0
-        self._samplers[i] = injection.sampler(latency_generator(seed, self._draw))
+        # A generator that nothing is drawn from takes its time all the same.
+        self._samplers[i] = (
+            None
+            if injection.latency is None
+            else injection.sampler(latency_generator(seed, self._draw))
+        )
         self._block[i] = self._native_us
 
     def take(self, decision: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -143,6 +143,12 @@ def new_fleet(n: int) -> Fleet:
     )
 
 
+def put_vehicle(fleet: Fleet, i: int, of: Fleet, j: int) -> None:
+    """Make vehicle i what vehicle j of another fleet is."""
+    for array, theirs in zip(fleet, of, strict=True):
+        array[i] = theirs[j]
+
+
 STILL: Vec = (0.0, 0.0, 0.0)
 """Velocity of a vehicle at rest, and of calm air, NED [m/s]."""
 

@@ -28,7 +28,17 @@ from airl_mav.envs.encoding import shrink
 from airl_mav.envs.episode_arenas import EpisodeArenas
 from airl_mav.envs.estimation import Telemetry
 from airl_mav.envs.faults import later_us, twin_faults
-from airl_mav.envs.fleet import Fleet, Rules, Vehicle, Verdict, hover, new_fleet, vehicle_of
+from airl_mav.envs.fleet import (
+    STILL,
+    Fleet,
+    Rules,
+    Vehicle,
+    Verdict,
+    hover,
+    new_fleet,
+    put_vehicle,
+    vehicle_of,
+)
 from airl_mav.envs.flight import advance
 from airl_mav.envs.legs import Legs
 from airl_mav.envs.saved_state import State, Stateful
@@ -163,7 +173,8 @@ class Navigation(Stateful):
         )
         self.stages, self.arenas = self._places.stages, self._places.present
         self.seeds, self.zones = self._places.seeds, self._places.zones
-        self.fleet = new_fleet(n)
+        self.fleet, self._calm_start = new_fleet(n), new_fleet(1)
+        hover(self._calm_start, 0, rules.altitude_m, self._vehicle, battery=battery_charge)
         self._decision = np.zeros(n, np.int64)
         self._extra_us = np.zeros(n, np.int64)
         self._delays = DelayDraws(
@@ -224,13 +235,17 @@ class Navigation(Stateful):
     def _begin(self, i: int, seed: int, zone: int | None) -> None:
         self._places.begin(i, seed, zone)
         randomisation = self.spec.randomisation
-        airframe = self._vehicle.airframe
+        airframe = None
         if spreads(randomisation):
-            airframe = draw_airframe(airframe, randomisation, stream(seed, Stream.AIRFRAME))
-        altitude_m = self.spec.episode.altitude_m
+            rng = stream(seed, Stream.AIRFRAME)
+            airframe = draw_airframe(self._vehicle.airframe, randomisation, rng)
         north, east, down = self._winds.begin(i, seed).tolist()
-        steady = (north, east, down)
-        hover(self.fleet, i, altitude_m, self._vehicle, airframe, self._charge, steady)
+        wind = (north, east, down)
+        if airframe is None and wind == STILL:
+            put_vehicle(self.fleet, i, self._calm_start, 0)
+        else:
+            altitude_m = self.spec.episode.altitude_m
+            hover(self.fleet, i, altitude_m, self._vehicle, airframe, self._charge, wind)
         if self._trace is not None:
             self._trace.begin(i, self.fleet)
         self._decision[i] = 0
