@@ -19,7 +19,7 @@ from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.planner import Planner
 from airl_mav.envs.saved_state import State, Stateful
 from airl_mav.envs.spec import ExpertName
-from airl_mav.policy.action_sets import ActionSpec, commands, discrete_actions
+from airl_mav.policy.action_sets import CONTINUOUS, ActionSpec, commands, discrete_actions
 from airl_mav.policy.greedy import GreedyPolicy, GreedySettings
 
 DIRECTIONS = 48
@@ -44,8 +44,8 @@ class Choices(NamedTuple):
 def choices(spec: ActionSpec) -> Choices:
     """Return the actions that an expert chooses from."""
     count = discrete_actions(spec)
-    if count is None and spec.set != "velocity":
-        accepted = "a discrete action set, or 'velocity', for one that is taught"
+    if count is None and spec.set not in CONTINUOUS:
+        accepted = f"a discrete action set, or {' or '.join(map(repr, CONTINUOUS))}"
         raise FieldError("environment.actions", spec.set, accepted)
     if count is not None:
         actions: NDArray[Any] = np.arange(count)

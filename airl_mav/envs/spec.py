@@ -227,8 +227,8 @@ class EnvironmentSpec(ProfileModel):
     )
     actions: ActionSetName = Field(
         default="arc-25",
-        description="action set: arc-25, paper-25, velocity, or your own as MODULE:NAME or"
-        " FILE.py:NAME",
+        description="action set: arc-25, paper-25, velocity, velocity-fixed-yaw, or your own as"
+        " MODULE:NAME or FILE.py:NAME",
     )
     max_speed_m_s: float = quantity("fastest action", "m/s", gt=0, le=30, default=PAPER_SPEED_M_S)
     reward: RewardName = Field(

@@ -1,8 +1,9 @@
 """Action sets: from a network's output to a velocity command, in one place.
 
 `arc-25`: five speeds with five yaw rates. `paper-25`: the 25 actions of the paper's text.
-`velocity`: the paper's continuous pair, forward and right speed, the nose following. Any other is
-the user's own: a class, made without arguments, whose objects are an `ActionSet`.
+`velocity`: the paper's continuous pair, forward and right speed, the nose following;
+`velocity-fixed-yaw`: the same pair, the nose staying where it is. Any other is the user's own: a
+class, made without arguments, whose objects are an `ActionSet`.
 """
 
 from __future__ import annotations
@@ -19,7 +20,8 @@ from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.policy.actions import Action
 
-SHIPPED = ("arc-25", "paper-25", "velocity")
+CONTINUOUS = ("velocity", "velocity-fixed-yaw")
+SHIPPED = ("arc-25", "paper-25", *CONTINUOUS)
 ActionSetName = Annotated[str, plugins.part_name(plugins.ACTION_SETS, SHIPPED)]
 
 PAPER_SPEED_M_S = 5.0
@@ -68,7 +70,7 @@ def discrete_actions(spec: ActionSpec) -> int | None:
     """Return the number of discrete actions; None for a continuous set."""
     if spec.set not in SHIPPED:
         return _own(spec.set).discrete
-    return None if spec.set == "velocity" else 25
+    return None if spec.set in CONTINUOUS else 25
 
 
 def commands(spec: ActionSpec, actions: NDArray[Any]) -> NDArray[np.float64]:
@@ -77,8 +79,8 @@ def commands(spec: ActionSpec, actions: NDArray[Any]) -> NDArray[np.float64]:
     Args:
         spec: The action set.
         actions: (n,) whole numbers, from 0 on, of a discrete set; (n, 2) numbers of a continuous
-            one: of `velocity`, forward and right speed, each -1..1 of the fastest; anything beyond
-            is cut off.
+            one: of those shipped, forward and right speed, each -1..1 of the fastest; anything
+            beyond is cut off.
 
     Returns:
         (n, 3) forward and right [m/s] in the heading frame, yaw rate [rad/s], clockwise positive.
@@ -88,13 +90,15 @@ def commands(spec: ActionSpec, actions: NDArray[Any]) -> NDArray[np.float64]:
     """
     if spec.set not in SHIPPED:
         return _checked(spec, actions)
-    if spec.set != "velocity":
+    if spec.set not in CONTINUOUS:
         chosen: NDArray[np.float64] = _table(spec.set, spec.max_speed_m_s)[np.asarray(actions)]
         return chosen
     wanted = np.clip(np.asarray(actions, np.float64), -1.0, 1.0) * spec.max_speed_m_s
     # A vector, not a pair: the corner of the square is no faster than its edges.
     speed = np.hypot(wanted[:, 0], wanted[:, 1])
     wanted *= np.minimum(1.0, spec.max_speed_m_s / np.maximum(speed, 1e-9))[:, None]
+    if spec.set == "velocity-fixed-yaw":
+        return np.concatenate([wanted, np.zeros((len(wanted), 1))], axis=1)
     course = np.arctan2(wanted[:, 1], wanted[:, 0])
     # A vehicle that hovers has no course to turn to; the turn grows with the speed.
     turn = np.clip(FOLLOW_GAIN_1_S * course, -FOLLOW_MAX_RAD_S, FOLLOW_MAX_RAD_S)

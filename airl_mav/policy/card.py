@@ -17,8 +17,8 @@ from airl_mav.core.constants import Level
 from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import ProfileModel, quantity, validated
 from airl_mav.core.files import read_json
+from airl_mav.policy.action_sets import CONTINUOUS, ActionSpec
 from airl_mav.policy.action_sets import SHIPPED as SHIPPED_ACTION_SETS
-from airl_mav.policy.action_sets import ActionSpec
 from airl_mav.policy.actions import DecisionTiming
 from airl_mav.policy.layouts import SHIPPED as SHIPPED_LAYOUTS
 from airl_mav.policy.layouts import ObservationSpec, camera_mismatch
@@ -176,7 +176,7 @@ class PolicyFacts(ProfileModel):
     @model_validator(mode="after")
     def _random_actions_are_discrete(self) -> PolicyFacts:
         # A set of the user's is not asked: reading a card runs no code.
-        if self.epsilon and self.actions.set == "velocity":
+        if self.epsilon and self.actions.set in CONTINUOUS:
             raise ValueError(
                 f"epsilon = {self.epsilon:g}: accepted: 0 with the action set {self.actions.set!r}"
             )

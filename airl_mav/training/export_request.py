@@ -108,9 +108,9 @@ class ExportRequest(BaseModel):
     )
     actions: ActionSetName | None = Field(
         default=None,
-        description="action set that the model was trained with: arc-25, paper-25, velocity, or"
-        " your own as MODULE:NAME or FILE.py:NAME; by default arc-25, or velocity where a .zip has"
-        " continuous actions",
+        description="action set that the model was trained with: arc-25, paper-25, velocity,"
+        " velocity-fixed-yaw, or your own as MODULE:NAME or FILE.py:NAME; by default arc-25, or"
+        " velocity where a .zip has continuous actions",
     )
     max_speed_m_s: float | None = Field(
         default=None, description=f"fastest action, m/s; by default {PAPER_SPEED_M_S:g}"

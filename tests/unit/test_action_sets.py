@@ -73,6 +73,16 @@ def test_who_changes_the_commands_changes_no_later_ones(name: str) -> None:
 # --- continuous
 
 
+@given(st.lists(st.tuples(st.floats(-2, 2), st.floats(-2, 2)), min_size=1, max_size=8))
+def test_with_fixed_yaw_it_flies_the_same_way_and_never_turns(
+    actions: list[tuple[float, float]],
+) -> None:
+    fixed = commands(spec("velocity-fixed-yaw"), np.array(actions))
+    np.testing.assert_array_equal(fixed[:, :2], fly(*actions)[:, :2])
+    assert not fixed[:, 2].any()
+    assert discrete_actions(spec("velocity-fixed-yaw")) is None
+
+
 def fly(*actions: tuple[float, float], speed: float = 5.0) -> np.ndarray:
     return commands(spec("velocity", speed), np.array(actions))
 
