@@ -6,13 +6,14 @@ from pathlib import Path
 from typing import Any, cast
 
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.save_util import load_from_zip_file
 
 from airl_mav.core.errors import UsageError
 from airl_mav.training.store import TrainingFolder
 
 
-def begin_with(model: BaseAlgorithm, run: Path) -> None:
+def begin_with(model: BaseAlgorithm, run: Path, log_std: float | None = None) -> None:
     """Give a learner the best weights of a training run; its optimiser begins afresh.
 
     Weights are all that the networks of a learner hold: the value's and the exploration's too.
@@ -20,6 +21,8 @@ def begin_with(model: BaseAlgorithm, run: Path) -> None:
     Args:
         model: A learner of the same algorithm, with the same inputs, network and actions.
         run: Folder of the training run, of which the newest evaluation may still be to come.
+        log_std: Logarithm of the standard deviation of continuous actions to begin with; None:
+            the run's. What an expert has taught knows none.
 
     Raises:
         UsageError: There is no run, it has not been evaluated yet, or its weights do not fit.
@@ -38,3 +41,5 @@ def begin_with(model: BaseAlgorithm, run: Path) -> None:
             f"initial = '{run}': weights of {learned!r} that do not fit; accepted: a run with the"
             " same algorithm, network, observation and actions"
         ) from None
+    if log_std is not None:
+        cast("ActorCriticPolicy", model.policy).log_std.data.fill_(log_std)

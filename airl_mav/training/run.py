@@ -134,7 +134,9 @@ def fit(
         callback.restore(meta)
         folder.forget_after(model.num_timesteps)
     elif config.initial is not None:
-        begin_with(model, Path(config.initial))
+        log_std = config.algorithm.options.get("log_std_init")
+        assert log_std is None or isinstance(log_std, int | float)  # noqa: S101 (validated)
+        begin_with(model, Path(config.initial), log_std)
     left = config.steps - model.num_timesteps
     if left > 0 and not callback.done:
         model.learn(

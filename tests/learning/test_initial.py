@@ -53,6 +53,20 @@ def test_begins_with_the_best_weights_of_a_run(before: Path, tmp_path: Path) -> 
     assert noted == str(before)
 
 
+def test_ppo_goes_on_from_what_an_expert_has_taught(tmp_path: Path) -> None:
+    """The mean of its actions is the pupil's; how widely it explores is its own."""
+    environment = TINY["environment"] | {"actions": "velocity"}
+    taught = TINY | {"environment": environment, "algorithm": {"name": "bc", "expert": "greedy"}}
+    run.train(TrainingConfig.model_validate(taught), tmp_path / "taught", name="taught")
+    algorithm = {"name": "ppo", "learning_rate": 1e-12, "options": {"log_std_init": -1.7}}
+    changes = {"algorithm": algorithm, "initial": str(tmp_path / "taught")}
+    run.train(TrainingConfig.model_validate(taught | changes), tmp_path / "on", name="on")
+    ours, theirs = weights(tmp_path / "on"), weights(tmp_path / "taught")
+    assert torch.allclose(ours["action_net.weight"], theirs["action_net.weight"], atol=1e-6)
+    assert ours["log_std"].tolist() == pytest.approx([-1.7, -1.7], abs=1e-4)
+    assert theirs["log_std"].tolist() == [0.0, 0.0]
+
+
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
