@@ -45,11 +45,17 @@ the 30 moving obstacles of `crowded` it loses a fifth of the flights.
 MOST_M_S2 = 6.0
 """Greatest acceleration on the way [m/s2]; the first-order response alone would be quicker."""
 
-LEAST_GAP_M = 0.15
+LEAST_GAP_M = 0.3
 """A lesser gap is as bad as a contact [m]."""
 
-WARY_GAP_M = 0.7
-"""A lesser gap to a moving obstacle costs something [m]."""
+WARY_GAP_M = 2.0
+"""A lesser gap to a moving obstacle costs something [m].
+
+The planner itself would need less; who learns from it knows less than the planner does.
+"""
+
+WARY = 4.0
+"""What a second is worth in which such a gap is 1 m less [s]."""
 
 TURN_S = 0.4
 """What a radian between the nose and the way is worth [s], unless the camera sees all round."""
@@ -261,7 +267,7 @@ def best_command(
                     cost += 1000.0 - 100.0 * min(t, 5.0) - 10.0 * max(-5.0, min(standing, moving))
                     break
                 if moving < WARY_GAP_M:
-                    cost += (WARY_GAP_M - moving) * STEP_S
+                    cost += WARY * (WARY_GAP_M - moving) * STEP_S
                 dx, dy = x - batch.goal[i, 0], y - batch.goal[i, 1]
                 there = dx * dx + dy * dy < body.arrived * body.arrived
             cost += t
