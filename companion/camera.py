@@ -67,6 +67,8 @@ class ZmqFrameSource:
         """Messages that were no frames, or frames of another size than the first one's."""
         self.failure: str | None = None
         """Why no more frames come: never known here, as a publisher may start at any time."""
+        self.dropped = 0
+        """Frames that never came here: not known, as those between two looks are meant to go."""
         self._clock = clock
         self._newest: ReceivedFrame | None = None
         self._owns_context = context is None

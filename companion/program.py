@@ -207,6 +207,9 @@ def fly_alone(
             link.tell(f"airl: {result.reason}")
             if frames.failure is not None:
                 result = replace(result, notes=(*result.notes, frames.failure))
+            if frames.dropped:
+                told = f"{frames.dropped} images of camera {asked.camera} were lost on their way"
+                result = replace(result, notes=(*result.notes, told))
             if box is not None:
                 box.end(result.reason, result.notes)
                 if box.failure is not None:

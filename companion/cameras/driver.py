@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from airl_mav.camera.frame import Frame
 from airl_mav.core.clock import Clock
+from airl_mav.core.constants import US_PER_S
 from companion.camera import ReceivedFrame
 from companion.cameras.fitting import Fitting, Lens
 
@@ -25,6 +26,18 @@ READ_S = 0.1
 
 FAILED_S = 5.0
 """A camera that delivers nothing for so long has failed [s of waiting]."""
+
+
+OLDEST_US = US_PER_S
+"""An image that seems to be older is stamped by another clock [µs]."""
+
+
+def plausible_age_us(age_us: int) -> int:
+    """Return the age of an image by its stamp [µs]; 0 where that is of another clock.
+
+    A calendar may have been set since, or the stamp be the camera's own or of a recording.
+    """
+    return age_us if 0 <= age_us <= OLDEST_US else 0
 
 
 class Silence:
@@ -51,6 +64,8 @@ class DepthImage(NamedTuple):
     depth_mm: NDArray[np.uint16]  # (height, width) along the optical axis [mm]; 0 = no return
     age_us: int
     """Time since the exposure, by the driver's stamps [µs]; 0 where it has none."""
+    number: int | None = None
+    """Counts up by one per image that the camera takes; None where the camera does not count."""
 
 
 class DepthCamera(Protocol):
@@ -73,6 +88,16 @@ class DepthCamera(Protocol):
         ...
 
 
+def missing_between(last: int | None, number: int | None) -> int:
+    """Return how many images are missing between two by their numbers.
+
+    None are where one has no number, or where the numbers begin anew: a recording that is over.
+    """
+    if last is None or number is None:
+        return 0
+    return max(0, number - last - 1)
+
+
 class CameraThread:
     """The newest image of a driver, as a frame of the wanted size. Implements `FrameSource`."""
 
@@ -87,6 +112,8 @@ class CameraThread:
         """
         self.failure: str | None = None
         """Why no more images come, once the driver has raised."""
+        self.dropped = 0
+        """Images that the camera took and the driver never returned, by their numbers."""
         self._name, self._camera, self._clock, self._fitting = name, camera, clock, fitting
         self._newest: ReceivedFrame | None = None
         self._changed = threading.Condition()
@@ -116,13 +143,15 @@ class CameraThread:
         self._camera.close()
 
     def _read_on(self) -> None:
-        sequence = 0
+        sequence, last_number = 0, None
         try:
             while not self._ended.is_set():
                 image = self._camera.read(READ_S)
                 if image is None:
                     continue
                 taken_us = self._clock.time_us() - image.age_us
+                self.dropped += missing_between(last_number, image.number)
+                last_number = image.number
                 # Fitted before the stamp of arrival: it is part of how long a frame takes.
                 depth_mm = self._fitting.fit(image.depth_mm)
                 frame = Frame(sequence, taken_us, depth_mm, self._fitting.wanted)

@@ -16,7 +16,7 @@ from airl_mav.camera.frame import MAX_MM, MM_PER_M
 from airl_mav.core.clock import utc_us
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.errors import FieldError
-from companion.cameras.driver import DepthImage, Silence
+from companion.cameras.driver import DepthImage, Silence, plausible_age_us
 from companion.cameras.fitting import Lens
 
 RATE_HZ = 30
@@ -72,7 +72,7 @@ class RealSense:
         unit_mm = depth.get_units() * MM_PER_M
         if abs(unit_mm - 1.0) > 1e-6:
             image = np.clip(np.rint(image * unit_mm), 0, MAX_MM).astype(np.uint16)
-        return DepthImage(image, self._age_us(depth))
+        return DepthImage(image, self._age_us(depth), depth.get_frame_number())
 
     def close(self) -> None:
         """Stop the stream."""
@@ -83,9 +83,7 @@ class RealSense:
         """Return how old an image is [µs]; 0 where it is stamped by the camera's own clock."""
         if frame.get_frame_timestamp_domain() == rs.timestamp_domain.hardware_clock:
             return 0
-        age_us = self._utc_now_us() - int(frame.get_timestamp() * US_PER_MS)
-        # The calendar may have been set since, and a recording is of another day.
-        return age_us if 0 <= age_us <= US_PER_S else 0
+        return plausible_age_us(self._utc_now_us() - int(frame.get_timestamp() * US_PER_MS))
 
 
 def open_realsense(which: str) -> RealSense:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from airl_mav.camera.frame import MAX_MM, MM_PER_M
 from airl_mav.core.clock import NS_PER_US
 from airl_mav.core.constants import US_PER_S
+from companion.cameras.driver import plausible_age_us
 from companion.cameras.fitting import Lens
 
 IMAGE, CAMERA_INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo"
@@ -21,9 +22,6 @@ IMAGE, CAMERA_INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo"
 
 MILLIMETRES, METRES = ("16UC1", "mono16"), ("32FC1",)
 """Encodings of depth images, by their unit (ROS Enhancement Proposal 118)."""
-
-OLDEST_US = US_PER_S
-"""An image that seems to be older is stamped by another clock [µs]."""
 
 
 def depth_mm(message: Any) -> NDArray[np.uint16]:
@@ -67,8 +65,7 @@ def stamped_us(message: Any) -> int:
 
 def age_us(message: Any, now_us: int) -> int:
     """Return how old an image is at a time since 1970 [µs]; 0 where its clock is another one."""
-    age = now_us - stamped_us(message)
-    return age if 0 <= age <= OLDEST_US else 0
+    return plausible_age_us(now_us - stamped_us(message))
 
 
 def lens_of(message: Any) -> Lens:
