@@ -154,8 +154,9 @@ class CompanionAddresses(ProfileModel):
     camera: str = Field(
         default="tcp://127.0.0.1:5600",
         description="depth camera: the ZeroMQ address of its publisher (tcp://HOST:PORT, ipc://PATH);"
-        " realsense, realsense:SERIAL or realsense:FILE.bag; a topic of ROS 2, ros2:/TOPIC, or a"
-        " recording, rosbag:PATH; a driver of your own, FILE.py:NAME or MODULE:NAME",
+        " realsense, realsense:SERIAL or realsense:FILE.bag; oak-d or oak-d:DEVICE (its id, or its"
+        " network address); a topic of ROS 2, ros2:/TOPIC, or a recording, rosbag:PATH; a driver of"
+        " your own, FILE.py:NAME or MODULE:NAME",
     )
 
 

@@ -1,4 +1,4 @@
-"""The camera that `--camera` names: an address, a RealSense, or a driver of the user's."""
+"""The camera that `--camera` names: an address, a driver that is shipped, or one of the user's."""
 
 from __future__ import annotations
 
@@ -12,11 +12,12 @@ from companion.camera import FrameSource, open_camera
 from companion.cameras.driver import CameraThread, DepthCamera
 from companion.cameras.fitting import Fitting, check_coverage
 
-REALSENSE, ROS2, ROSBAG = "realsense", "ros2", "rosbag"
+REALSENSE, OAK_D, ROS2, ROSBAG = "realsense", "oak-d", "ros2", "rosbag"
 """Drivers that are shipped: words before a colon."""
 
 EXTRAS = {
     REALSENSE: "librealsense (pip install pyrealsense2)",
+    OAK_D: "depthai (pip install 'airl-mav[oak]')",
     ROS2: "Cyclone DDS and rosbags (pip install 'airl-mav[ros2]')",
     ROSBAG: "rosbags (pip install 'airl-mav[ros2]')",
 }
@@ -46,8 +47,8 @@ def open_named_camera(name: str, clock: Clock, wanted: Intrinsics, whose: str) -
 
     Args:
         name: tcp://HOST:PORT or ipc://PATH; "realsense", "realsense:SERIAL" or
-            "realsense:FILE.bag"; "ros2:/TOPIC"; "rosbag:PATH" or "rosbag:PATH:/TOPIC";
-            FILE.py:NAME, MODULE:NAME or the entry point of a driver.
+            "realsense:FILE.bag"; "oak-d" or "oak-d:DEVICE"; "ros2:/TOPIC"; "rosbag:PATH" or
+            "rosbag:PATH:/TOPIC"; FILE.py:NAME, MODULE:NAME or the entry point of a driver.
         clock: The companion's, for the stamps.
         wanted: What images of a driver are made into; an address sends what it sends.
         whose: Whose camera `wanted` is: "vehicle quad".
@@ -84,8 +85,8 @@ def _driver(name: str, clock: Clock) -> DepthCamera:
             raise FieldError("camera", name, problem=f"needs {EXTRAS[brand]}: {error}") from None
     if reference(CAMERAS, name) is None:
         accepted = (
-            "tcp://HOST:PORT, ipc://PATH, realsense, ros2:/TOPIC, rosbag:PATH, FILE.py:NAME or"
-            " MODULE:NAME"
+            "tcp://HOST:PORT, ipc://PATH, realsense, oak-d, ros2:/TOPIC, rosbag:PATH,"
+            " FILE.py:NAME or MODULE:NAME"
         )
         raise FieldError("camera", name, accepted)
     made = load_part(CAMERAS, name, lambda part: callable(getattr(part, "read", None)))
@@ -104,6 +105,10 @@ def _shipped(brand: str, which: str, clock: Clock) -> DepthCamera:
         from companion.cameras.realsense import open_realsense
 
         return open_realsense(which)
+    if brand == OAK_D:
+        from companion.cameras.oak_d import open_oak_d
+
+        return open_oak_d(which)
     if not which.startswith("/") if brand == ROS2 else not which:
         raise FieldError("camera", f"{brand}:{which}", "ros2:/TOPIC or rosbag:PATH")
     if brand == ROS2:

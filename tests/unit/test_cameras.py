@@ -266,7 +266,7 @@ def test_in_lockstep_the_camera_is_an_address() -> None:
     [
         (
             "usb",
-            "accepted: tcp://HOST:PORT, ipc://PATH, realsense, ros2:/TOPIC, rosbag:PATH, FILE",
+            "accepted: tcp://HOST:PORT, ipc://PATH, realsense, oak-d, ros2:/TOPIC, rosbag:PATH, FI",
         ),
         ("udp://1.2.3.4:5", "accepted: tcp://HOST:PORT, ipc://PATH"),
         ("{}/none.py:Mine", "none.py: no such file"),

@@ -44,7 +44,8 @@ names = [m.name for m in pkgutil.walk_packages(companion.__path__, "companion.")
 assert len(names) >= 5, names
 # Drivers that come with an extra.
 for driver, needs in (
-    ("realsense", ["pyrealsense2"]), ("ros2", ["cyclonedds", "rosbags"]), ("rosbag", ["rosbags"])
+    ("oak_d", ["depthai"]), ("realsense", ["pyrealsense2"]),
+    ("ros2", ["cyclonedds", "rosbags"]), ("rosbag", ["rosbags"]),
 ):
     if None in map(importlib.util.find_spec, needs):
         names.remove(f"companion.cameras.{driver}")

@@ -10,7 +10,7 @@ from tests.support.processes import run_alone
 
 OF_OTHER_EXTRAS = (
     *("mcap", "pyulog", "foxglove", "viser", "mitsuba", "cyclonedds", "rosbags", "ray"),
-    *("gymnasium", "stable_baselines3", "sb3_contrib", "torch", "onnx", "pyrealsense2"),
+    *("gymnasium", "stable_baselines3", "sb3_contrib", "torch", "onnx", "pyrealsense2", "depthai"),
 )
 """Packages of extras that no flight needs, by the name that is imported."""
 

@@ -1,0 +1,185 @@
+"""Luxonis OAK-D stereo cameras, through depthai (the extra `oak`).
+
+The camera matches its two images itself and sends depth. What is expected of it is what the vehicle
+profile `quad-oak-d` says: 640 x 400 pixels, disparities up to 95 px in steps of an eighth.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+from collections.abc import Callable
+from contextlib import suppress
+from datetime import timedelta
+from typing import Any
+
+import depthai as dai
+import numpy as np
+
+from airl_mav.core.errors import FieldError
+from companion.cameras.driver import FAILED_S, DepthImage, Silence, plausible_age_us
+from companion.cameras.fitting import Lens
+
+RATE_HZ = 30.0
+SIZE_PX = 640, 400
+"""Width and height of the images that are matched (400P): half of what the sensors have, for which
+the camera's matcher keeps up with 30 images a second in subpixel mode."""
+
+SUBPIXEL_BITS = 3
+"""Steps of disparity are 2^-3 px."""
+
+_US = timedelta(microseconds=1)
+
+
+class OakD:
+    """The depth images of a running pipeline. Implements `driver.DepthCamera`."""
+
+    def __init__(
+        self,
+        name: str,
+        pipeline: Any,
+        depth: Any,
+        now: Callable[[], timedelta] | None = None,
+    ) -> None:
+        """Start a pipeline, and wait for its first image, which describes the lens.
+
+        Args:
+            name: What the camera is called in messages.
+            pipeline: `depthai.Pipeline` of a device, or of nodes of the host's; stopped by `close`.
+            depth: Its output of depth images (`depthai.Node.Output`): RAW16 [mm], 0 = no return,
+                rectified.
+            now: The host's monotonic time, to which depthai brings the camera's stamps; None: that
+                of depthai's clock.
+
+        Raises:
+            FieldError: No image comes, or the first one is without intrinsics or no depth image.
+        """
+        self._pipeline, self._silence = pipeline, Silence()
+        self._now: Callable[..., timedelta] = dai.Clock.now if now is None else now
+        self._queue = depth.createOutputQueue(maxSize=1, blocking=False)
+        self._pipeline.start()
+        try:
+            first = self._taken(FAILED_S)
+            if first is None:
+                raise ValueError(f"no image for {FAILED_S:g} s")
+            self._lens = _lens_of(first)
+            _checked(first)
+        except (RuntimeError, ValueError) as error:
+            self.close()
+            raise FieldError("camera", name, problem=" ".join(str(error).split())) from None
+        self._first: Any | None = first
+
+    @property
+    def lens(self) -> Lens:
+        """Return the lens of the rectified images, by the calibration that the device holds."""
+        return self._lens
+
+    def read(self, timeout_s: float) -> DepthImage | None:
+        """Wait for the next image; see `driver.DepthCamera`.
+
+        Raises RuntimeError when none has come for 5 s or the connection is lost, and ValueError for
+        one that holds no depth.
+        """
+        frame, self._first = self._first, None
+        if frame is None:
+            frame = self._taken(timeout_s)
+        if frame is None:
+            self._silence.lasted(timeout_s)
+            return None
+        self._silence.broken()
+        # The middle of the exposure, as depthai reckons it from the stamp of the readout.
+        taken = frame.getTimestamp(dai.CameraExposureOffset.MIDDLE)
+        return DepthImage(
+            _checked(frame),
+            plausible_age_us((self._now() - taken) // _US),
+            frame.getSequenceNum(),
+        )
+
+    def close(self) -> None:
+        """Stop the camera, and disconnect from it."""
+        with suppress(RuntimeError):  # unplugged: there is nothing to stop
+            self._pipeline.stop()
+            # Its threads still run: depthai does not survive that they outlive the pipeline.
+            self._pipeline.wait()
+
+    def _taken(self, timeout_s: float) -> Any | None:
+        """Wait for the next frame; None: there is none in time."""
+        try:
+            return self._queue.get(timedelta(seconds=timeout_s))
+        except dai.MessageQueue.QueueException:
+            raise RuntimeError("the connection is closed") from None
+
+
+def _lens_of(frame: Any) -> Lens:
+    """Return the lens of an image, as depthai's own nodes take it to make points of depth.
+
+    It follows the image through rectification and scaling, from the calibration in the device. The
+    distortion that goes with it is that of the sensor's image: there is none after rectification.
+
+    Raises ValueError for an image without intrinsics.
+    """
+    about = frame.getTransformation()
+    if not about.isValid():
+        raise ValueError("its images come without intrinsics: the device is not calibrated")
+    (fx, _, cx), (_, fy, cy), _ = about.getIntrinsicMatrix()
+    if not (np.isfinite([fx, fy, cx, cy]).all() and min(fx, fy) > 0.0):
+        raise ValueError(f"focal lengths {fx:g} and {fy:g} px, which is no pinhole")
+    width, height = about.getSize()
+    return Lens(width, height, fx, fy, cx, cy)
+
+
+def _checked(frame: Any) -> Any:
+    """Return the depth (height, width) of an image [mm]. Raises ValueError for another kind."""
+    if frame.getType() != dai.ImgFrame.Type.RAW16:
+        raise ValueError(f"an image of type {frame.getType().name}; accepted: RAW16")
+    # Copied: what depthai returns may be its own memory.
+    return np.array(frame.getFrame(), np.uint16)
+
+
+def open_oak_d(which: str) -> OakD:
+    """Open a camera, and start to match.
+
+    Args:
+        which: "" for the first camera; a device id, as `depthai` lists it; or the address of one on
+            the network (PoE), which need not be in the list.
+
+    Raises:
+        FieldError: There is no such camera, another program has it, it is no stereo camera, or it
+            sends no depth images.
+    """
+    name = f"oak-d:{which}" if which else "oak-d"
+    found = [each.getDeviceId() for each in dai.Device.getAllAvailableDevices()]
+    if not _is_address(which):
+        if not found:
+            raise FieldError("camera", name, problem="depthai finds no camera")
+        if which and which not in found:
+            raise FieldError("camera", name, f"oak-d:{' or oak-d:'.join(found)}")
+    try:
+        device = dai.Device(dai.DeviceInfo(which)) if which else dai.Device()
+        pipeline = dai.Pipeline(device)
+        depth = _matching(pipeline)
+    except RuntimeError as error:
+        raise FieldError("camera", name, problem=" ".join(str(error).split())) from None
+    return OakD(name, pipeline, depth)
+
+
+def _is_address(which: str) -> bool:
+    try:
+        ipaddress.ip_address(which)
+    except ValueError:
+        return False
+    return True
+
+
+def _matching(pipeline: Any) -> Any:
+    """Make the camera match its images as the profile says; return the output of depth images."""
+    stereo = pipeline.create(dai.node.StereoDepth).build(
+        autoCreateCameras=True, size=SIZE_PX, fps=RATE_HZ
+    )
+    stereo.setRectification(True)
+    # Disparities that the other image's view does not confirm are wrong ones at edges.
+    stereo.setLeftRightCheck(True)
+    stereo.setExtendedDisparity(False)
+    stereo.setSubpixel(True)
+    stereo.setSubpixelFractionalBits(SUBPIXEL_BITS)
+    stereo.initialConfig.setDepthUnit(dai.LengthUnit.MILLIMETER)
+    return stereo.depth
