@@ -39,6 +39,12 @@ OUT_OF_TIME = "out of time"
 NOT_OURS = (TAKEN_OVER, DISARMED)
 """Why a flight ended in which nothing more may be commanded."""
 
+REASONS = (
+    *(*NOT_OURS, TELEMETRY_FROZEN, TELEMETRY_WRONG, CAMERA_FROZEN, CAMERA_WRONG),
+    *(FRAMES_LATE, BATTERY_LOW, OUT_OF_BOUNDS, OUT_OF_TIME),
+)
+"""Every limit that can be broken."""
+
 MODE_KNOWN_S = 3.0
 """Time until a change of mode must have been reported [s]: three heartbeats of 1 Hz."""
 

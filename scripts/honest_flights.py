@@ -1,0 +1,174 @@
+"""How often do the companion's limits end a flight in which nothing is wrong?
+
+    python scripts/honest_flights.py [--flights 1000] [--out DIR]
+
+Flies honest flights in lockstep, with real MAVSDK, the full flight controller and the shipped
+policy of each arena, in a steady wind of 6 m/s whose direction is another in every flight, as late
+as a Raspberry Pi 4 that runs the paper's network. Nobody takes over and nothing fails, so whatever
+`companion/limits.py` ends is a false alarm. Every flight is a line of flights.csv in --out, and the
+same command goes on from there: with more --flights, too. Leaves table.json, which results.py
+publishes.
+"""
+
+from __future__ import annotations
+
+import math
+import shlex
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+
+import numpy as np
+import tyro
+from flown_lines import FlownLines
+from plants_compared import PAIRS
+from rich.console import Console
+
+from airl_mav.core.errors import EXIT_USAGE, UsageError
+from airl_mav.core.provenance import provenance
+from airl_mav.flight.judge import Outcome
+from airl_mav.flight.record import EpisodeRecord
+from airl_mav.flight.statistics import wilson
+from airl_mav.lockstep.flight import fly
+from airl_mav.profiles.conditions import WindSettings
+from airl_mav.report.saved_table import write_table
+from airl_mav.report.table import Column, TableView, print_table
+from airl_mav.scenario.model import Scenario
+from airl_mav.scenario.resolve import resolve
+from companion.limits import REASONS
+from published.record import behaviour_today
+
+WIND_M_S = 6.0
+COMPUTER, WORKLOAD = "ras-pi-4", "template-5x32"
+FLIGHTS_FILE = "flights.csv"
+
+
+@dataclass(frozen=True)
+class Command:
+    """Fly, and count."""
+
+    flights: int = 1000
+    """All together, the arenas in turn."""
+
+    seed: int = 1
+    """First seed."""
+
+    out: Path = Path("runs/honest-flights")
+    """Where flights.csv and table.json go."""
+
+
+@dataclass(frozen=True)
+class Honest:
+    """What a flight showed."""
+
+    seed: int
+    arena: str
+    outcome: str
+    navigated_s: float
+    """From the start of navigation to the verdict."""
+    decisions: int
+    alarm: str
+    """The limit that was broken, as the flight's notes tell it; empty: none was."""
+    behaviour: str
+    """Fingerprint of the flight behaviour that it was flown with."""
+
+
+def scenario_of(arena: str, policy: str, seed: int) -> Scenario:
+    """Return what a flight is: the direction of the wind is drawn with its seed."""
+    angle = np.random.default_rng(seed).uniform(0.0, 2.0 * math.pi)
+    wind = WindSettings(north_m_s=WIND_M_S * math.cos(angle), east_m_s=WIND_M_S * math.sin(angle))
+    return Scenario(
+        level="lockstep",
+        arena=arena,
+        policy=policy,
+        seed=seed,
+        wind=wind,
+        computer=COMPUTER,
+        workload=WORKLOAD,
+    )
+
+
+def alarm_of(record: EpisodeRecord) -> str:
+    """Return the limit that was broken in a flight, as its notes tell it; empty: none was."""
+    return next((note for note in record.notes if note.split(":")[0] in REASONS), "")
+
+
+def honest(arena: str, policy: str, seed: int, behaviour: str) -> Honest:
+    """Fly a seed."""
+    resolved = resolve(scenario_of(arena, policy, seed))
+    flown = fly(resolved, resolved.fresh_policy(seed), 0, seed)
+    record = flown.record
+    begun_us = record.ended_us if record.navigation_us is None else record.navigation_us
+    navigated_s = (record.ended_us - begun_us) / 1e6
+    decisions = len(flown.latency["capture_us"])
+    alarm = alarm_of(record)
+    return Honest(seed, arena, record.outcome.value, navigated_s, decisions, alarm, behaviour)
+
+
+def view_of(rows: Sequence[dict[str, str]]) -> TableView:
+    """Return the counts by arena. After a collision an alarm is none: the vehicle tumbles."""
+    counted = []
+    arenas = [arena for arena, _ in PAIRS]
+    for arena in [*arenas, "all"]:
+        mine = [row for row in rows if arena in ("all", row["arena"])]
+        hit = Outcome.COLLISION.value
+        false = sum(bool(row["alarm"]) and row["outcome"] != hit for row in mine)
+        rate = wilson(false, len(mine))
+        counted.append(
+            (
+                arena,
+                str(len(mine)),
+                str(sum(row["outcome"] == Outcome.SUCCESS.value for row in mine)),
+                str(sum(row["outcome"] == hit for row in mine)),
+                f"{sum(float(row['navigated_s']) for row in mine) / 60.0:.1f}",
+                str(sum(int(row["decisions"]) for row in mine)),
+                str(false),
+                "" if rate.high is None else f"{100.0 * rate.high:.2g} %",
+            )
+        )
+    columns = (
+        Column("arena", number=False),
+        Column("flights"),
+        Column("goals reached"),
+        Column("collisions"),
+        Column("navigated", "min"),
+        Column("decisions"),
+        Column("false alarms"),
+        Column("at most (95 %)"),
+    )
+    return TableView("honest", "Honest flights", columns, tuple(counted))
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Fly what is missing, and count."""
+    asked, console = tyro.cli(Command, args=words, description=__doc__), Console()
+    behaviour, deciding = behaviour_today(), dict(PAIRS)
+    path = asked.out / FLIGHTS_FILE
+    lines = FlownLines(path, [field.name for field in fields(Honest)])
+    if {row["behaviour"] for row in lines.rows} - {behaviour}:
+        raise UsageError(f"{path}: flown with another behaviour; accepted: {behaviour}")
+    known = {(row["arena"], int(row["seed"])) for row in lines.rows}
+    arenas = [arena for arena, _ in PAIRS]
+    for number in range(asked.flights):
+        arena, seed = arenas[number % len(arenas)], asked.seed + number // len(arenas)
+        if (arena, seed) in known:
+            continue
+        flight = honest(arena, deciding[arena], seed, behaviour)
+        lines.add(asdict(flight))
+        if flight.alarm:
+            console.print(f"{flight}", highlight=False)
+    view = view_of(lines.rows)
+    print_table(view, console)
+    words = sys.argv[1:] if words is None else words
+    command = shlex.join(["python", "scripts/honest_flights.py", *words])
+    write_table(view, asked.out, provenance(command), sorted(set(deciding.values())))
+    return 0
+
+
+if __name__ == "__main__":
+    try:
+        sys.exit(main())
+    except UsageError as error:
+        sys.stderr.write(f"honest_flights.py: {error}\n")
+        sys.exit(EXIT_USAGE)
