@@ -1,24 +1,28 @@
 """Fly the same episodes in lockstep on both plants, pybullet and kernel, and compare them.
 
-    python scripts/plants_compared.py --flights 100
+    python scripts/plants_compared.py --flights 100 --out runs/plants.csv
 
 Every flight is flown twice, from the same seeds, by real MAVSDK and the shipped policy of the
 arena. Positions are compared at 50 Hz until the flight is judged. Prints a row for each
-arena, and each pair that parts. Exit status 0: every pair ends alike, and within the limit.
+arena, and each pair that parts. With --out every pair is a line of that file, and the same command
+goes on from there. Exit status 0: every pair ends alike, and within the limit.
 """
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import tyro
+from flown_lines import FlownLines
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
+from airl_mav.core.errors import EXIT_USAGE, UsageError
 from airl_mav.flight.judge import Outcome
 from airl_mav.lockstep.flight import fly
 from airl_mav.rehearsal.run_folder import FlownEpisode
@@ -53,7 +57,7 @@ class Comparison:
     """How far positions may part, mm."""
 
     out: Path | None = None
-    """Write a line for each pair to this file (.csv)."""
+    """Append a line for each pair to this file (.csv), and go on from what it holds."""
 
 
 @dataclass(frozen=True)
@@ -103,19 +107,23 @@ def until_judged(flight: FlownEpisode) -> NDArray[np.float64]:
     return before
 
 
-def main() -> int:
+def main(words: Sequence[str] | None = None) -> int:
     """Compare, and print what was found."""
-    asked, console = tyro.cli(Comparison), Console()
+    asked, console = tyro.cli(Comparison, args=words), Console()
     deciding = dict(PAIRS)
+    lines = None if asked.out is None else FlownLines(asked.out, COLUMNS)
+    known = {} if lines is None else {(p.arena, p.seed): p for p in map(pair_of, lines.rows)}
     pairs: list[Pair] = []
     for seed in range(asked.seed, asked.seed + asked.flights):
         for arena in asked.arenas:
-            pair = compared(arena, deciding[arena], seed)
+            pair = known.get((arena, seed))
+            if pair is None:
+                pair = compared(arena, deciding[arena], seed)
+                if lines is not None:
+                    lines.add(row_of(pair))
             pairs.append(pair)
             if parted(pair, asked.limit_mm):
                 console.print(f"parted: {pair}", highlight=False)
-            if asked.out is not None:
-                save(asked.out, pairs)
     table = Table("arena", "pairs", "alike", "successes", "farthest apart")
     for arena in asked.arenas:
         mine = [pair for pair in pairs if pair.arena == arena]
@@ -132,18 +140,35 @@ def parted(pair: Pair, limit_mm: float) -> bool:
     return pair.outcomes[0] != pair.outcomes[1] or pair.apart_mm > limit_mm
 
 
-def save(path: Path, pairs: list[Pair]) -> None:
-    """Write a line for each pair."""
-    lines = ["arena,seed,pybullet,kernel,samples_pybullet,samples_kernel,apart_mm,landed_mm"]
-    lines += [
-        f"{p.arena},{p.seed},{','.join(p.outcomes)},{p.samples[0]},{p.samples[1]},"
-        f"{p.apart_mm:.6g},{p.landed_mm:.6g}"
-        for p in pairs
-    ]
-    beside = path.with_suffix(".tmp")
-    beside.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    beside.replace(path)
+COLUMNS = (
+    *("arena", "seed", "pybullet", "kernel", "samples_pybullet", "samples_kernel"),
+    *("apart_mm", "landed_mm"),
+)
+"""Of the file, in which a line is a pair."""
+
+
+def row_of(pair: Pair) -> dict[str, object]:
+    """Return the line of a pair."""
+    apart = f"{pair.apart_mm:.6g}", f"{pair.landed_mm:.6g}"
+    cells = (pair.arena, pair.seed, *pair.outcomes, *pair.samples, *apart)
+    return dict(zip(COLUMNS, cells, strict=True))
+
+
+def pair_of(row: Mapping[str, str]) -> Pair:
+    """Return the pair of a line."""
+    return Pair(
+        row["arena"],
+        int(row["seed"]),
+        (row["pybullet"], row["kernel"]),
+        (int(row["samples_pybullet"]), int(row["samples_kernel"])),
+        float(row["apart_mm"]),
+        float(row["landed_mm"]),
+    )
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    try:
+        sys.exit(main())
+    except UsageError as error:
+        sys.stderr.write(f"plants_compared.py: {error}\n")
+        sys.exit(EXIT_USAGE)
