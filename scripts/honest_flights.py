@@ -74,6 +74,15 @@ class Honest:
     """Fingerprint of the flight behaviour that it was flown with."""
 
 
+COLUMNS = tuple(field.name for field in fields(Honest))
+"""Of flights.csv, in which a line is a flight."""
+
+
+def row_of(flight: Honest) -> dict[str, object]:
+    """Return the line of a flight."""
+    return asdict(flight)
+
+
 def scenario_of(arena: str, policy: str, seed: int) -> Scenario:
     """Return what a flight is: the direction of the wind is drawn with its seed."""
     angle = np.random.default_rng(seed).uniform(0.0, 2.0 * math.pi)
@@ -145,7 +154,7 @@ def main(words: Sequence[str] | None = None) -> int:
     asked, console = tyro.cli(Command, args=words, description=__doc__), Console()
     behaviour, deciding = behaviour_today(), dict(PAIRS)
     path = asked.out / FLIGHTS_FILE
-    lines = FlownLines(path, [field.name for field in fields(Honest)])
+    lines = FlownLines(path, COLUMNS)
     if {row["behaviour"] for row in lines.rows} - {behaviour}:
         raise UsageError(f"{path}: flown with another behaviour; accepted: {behaviour}")
     known = {(row["arena"], int(row["seed"])) for row in lines.rows}
@@ -155,7 +164,7 @@ def main(words: Sequence[str] | None = None) -> int:
         if (arena, seed) in known:
             continue
         flight = honest(arena, deciding[arena], seed, behaviour)
-        lines.add(asdict(flight))
+        lines.add(row_of(flight))
         if flight.alarm:
             console.print(f"{flight}", highlight=False)
     view = view_of(lines.rows)
