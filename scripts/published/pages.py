@@ -17,7 +17,7 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.files import replace_file
 from airl_mav.policy.card import MeasuredResult, read_card
 from airl_mav.policy.card_writing import write_card
-from published import tables_gap, tables_levels, tables_policies
+from published import tables_gap, tables_levels, tables_policies, tables_response
 from published.blocks import block_of
 from published.declared import read_declared
 from published.record import ROOT, FlownRun, Record
@@ -31,7 +31,7 @@ ALONE = re.compile(r"^ *<!-- (?:results:|end of results)", re.M)
 
 POLICIES = ROOT / "profiles" / "policies"
 
-TABLES = (tables_gap, tables_levels, tables_policies)
+TABLES = (tables_gap, tables_levels, tables_policies, tables_response)
 """Imported, they have declared their blocks."""
 
 
