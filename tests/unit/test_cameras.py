@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -280,6 +281,23 @@ def test_a_camera_that_cannot_be_opened_is_one_line(name: str, told: str, tmp_pa
     with pytest.raises(FieldError, match=told) as caught:
         open_named_camera(name.format(tmp_path), SimClock(), WANTED, "vehicle quad")
     assert caught.value.field == "camera"
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "library", "driver", "told"),
+    [
+        ("oak-d", "depthai", "oak_d", r"needs depthai \(pip install 'airl-mav\[oak\]'\)"),
+        ("realsense", "pyrealsense2", "realsense", "needs librealsense"),
+    ],
+)
+def test_a_library_that_is_not_installed_is_named(
+    name: str, library: str, driver: str, told: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, library, None)
+    monkeypatch.delitem(sys.modules, f"companion.cameras.{driver}", raising=False)
+    with pytest.raises(FieldError, match=told) as caught:
+        open_named_camera(name, SimClock(), WANTED, "vehicle quad")
     assert "\n" not in str(caught.value)
 
 
