@@ -61,6 +61,7 @@ CASES: tuple[Case, ...] = (
     Case("gps bias 20,0,0m"),
     Case("gps drift 0.5,0,0m/s"),
     Case("gps delay 200ms"),
+    Case("gps delay 1s", FALLS),
     Case("motor1 off", FALLS),
     Case("motor2 weak 75%"),
     Case("battery drop 60%"),

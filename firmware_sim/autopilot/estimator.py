@@ -27,6 +27,7 @@ from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.autopilot_state import Estimate
 from firmware_sim.autopilot.consistency import Compass, Consistency, Restart
 from firmware_sim.autopilot.filter_kernel import KernelFilter
+from firmware_sim.autopilot.fusion_horizon import FusionHorizon
 from firmware_sim.autopilot.magnetic_field import FieldCheck
 from firmware_sim.interfaces import GpsFix, SensorSample
 
@@ -149,6 +150,7 @@ class Estimator:
         """Sees inertial sensors that have gone wrong."""
         self.compass = Compass()
         """Whether the compass is believed."""
+        self._horizon = FusionHorizon()
         self._field: Vector | None = None
         """The newest that the compass has measured (3,) FRD [gauss]; before alignment the mean."""
 
@@ -158,7 +160,7 @@ class Estimator:
         if self.origin is None:
             self._align(sample)
         else:
-            self.filter.predict(self.state, sample.gyro, sample.accel)
+            self._predict(sample)
             if sample.gps is not None:
                 self._fuse_gps(sample.gps, self.origin)
             if sample.pressure_hpa is not None:
@@ -299,6 +301,13 @@ class Estimator:
         q[es.BARO] = BARO_WALK_M_SQRT_S**2 * TICK_S
         return q
 
+    def _predict(self, sample: SensorSample) -> None:
+        state, horizon = self.state, self._horizon
+        before = state[es.P : es.Q].copy() if horizon.is_past else None
+        self.filter.predict(state, sample.gyro, sample.accel)
+        if before is not None:
+            horizon.moved(before, state[es.P : es.Q])
+
     # --- measurements
 
     def _fuse(self, m: Measurement) -> None:
@@ -311,20 +320,26 @@ class Estimator:
             m.fused_us = self._time_us
 
     def _fuse_gps(self, fix: GpsFix, origin: Geodetic) -> None:
-        measured, state, value = geodetic_to_local(fix.position, origin), self.state, self._value
+        measured, value = geodetic_to_local(fix.position, origin), self._value
         r_p, r_v = value("EKF2_GPS_P_NOISE") ** 2, value("EKF2_GPS_V_NOISE") ** 2
-        r_v = self._check_velocity(fix.velocity_ned, r_v)
-        m = self._gps_horizontal
-        m.innovation[:2] = measured[:2] - state[es.P : es.P + 2]
-        m.innovation[2:] = fix.velocity_ned[:2] - state[es.V : es.V + 2]
+        self._horizon.assume(value("EKF2_GPS_DELAY"))
+        r_v = self._check_velocity(fix.velocity_ned - self._then()[3:], r_v)
+        m, then = self._gps_horizontal, self._then()
+        m.innovation[:2] = measured[:2] - then[:2]
+        m.innovation[2:] = fix.velocity_ned[:2] - then[3:5]
         m.variance[:2], m.variance[2:] = r_p, r_v
         self._fuse(m)
-        m = self._gps_vertical
-        m.innovation[0] = measured[2] - state[es.P + 2]
-        m.innovation[1] = fix.velocity_ned[2] - state[es.V + 2]
+        m, then = self._gps_vertical, self._then()
+        m.innovation[0] = measured[2] - then[2]
+        m.innovation[1] = fix.velocity_ned[2] - then[5]
         # A receiver's height is about half as good as its horizontal position.
         m.variance[0], m.variance[1] = max(fix.epv_m, math.sqrt(r_p)) ** 2, r_v
         self._fuse(m)
+
+    def _then(self) -> Vector:
+        """Return position and velocity (6,) NED when a fix of now was measured."""
+        state, horizon = self.state, self._horizon
+        return horizon.seen_from(state) if horizon.is_past else state[es.P : es.Q]
 
     def _fuse_baro(self, pressure: float) -> None:
         height = altitude_m(pressure) - self._origin_altitude_baro
@@ -351,10 +366,9 @@ class Estimator:
 
     # --- inertial sensors that have gone wrong
 
-    def _check_velocity(self, measured: Vector, variance: float) -> float:
+    def _check_velocity(self, innovation: Vector, variance: float) -> float:
         """Restart the filter where it must; return the variance of the measured velocity."""
         excess = self.consistency.velocity_excess
-        innovation = measured - self.state[es.V : es.Q]
         sigma = np.sqrt(self.filter.covariance.diagonal()[es.VEL : es.ATT] + variance)
         acceleration = self.state[es.ACCELERATION : es.SIGMA]
         restart = self.consistency.velocity(innovation, sigma, acceleration, self._time_us)
