@@ -50,6 +50,9 @@ class SensorSample(NamedTuple):
     pressure_hpa: float | None = None
     """Static pressure [hPa]."""
     gps: GpsFix | None = None
+    esc_outputs: tuple[float, float, float, float] | None = None
+    """What the speed controllers report that their motors do, as commands 0..1 of healthy ones;
+    None: what they are told."""
 
 
 class ActuatorControls(NamedTuple):

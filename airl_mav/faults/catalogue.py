@@ -64,6 +64,8 @@ CASES: tuple[Case, ...] = (
     Case("gps delay 1s", FALLS),
     Case("motor1 off", FALLS),
     Case("motor2 weak 75%"),
+    Case("motor2 mismatch 20%"),
+    Case("motor2 slow 4x"),
     Case("battery drop 60%"),
     Case("battery drop 92%"),
     Case("battery sag 0.3V"),

@@ -166,6 +166,15 @@ _MOTOR_KINDS = {
         "its thrust is less than it should be",
         Amount("share of the thrust that is left", "", 0.0, 1.0, _SHARE),
     ),
+    "mismatch": Kind(
+        "its thrust is more or less than the others' by a constant share, up to its greatest one:"
+        " another propeller, a speed controller that is not calibrated",
+        Amount("share that it has more; less where negative", "", -0.9, 1.0, _SHARE),
+    ),
+    "slow": Kind(
+        "it changes its speed more slowly",
+        Amount("factor of its time constant", "", 1.0, 100.0, _TIMES),
+    ),
 }
 _OTHER_KINDS: dict[tuple[Part, str], Kind] = {
     ("battery", "off"): Kind("the power module reads an empty battery; the motors go on"),

@@ -128,6 +128,8 @@ class BuiltinAutopilot:
         self.estimator.step(sensors.trusted(sample) if sensors.distrusted else sample)
         self._snapshot = None
         self._newest.take(sample)
+        if sample.esc_outputs is not None:
+            supervisor.watch.hear_escs(time_us, self._motors, sample.esc_outputs)
         if self._home.place is None:
             self._home.set_here()
         readiness = READINESS[self.flight.phase][self.estimator.healthy]

@@ -296,6 +296,8 @@ class AutopilotState(NamedTuple):
     """Heading at home [rad]."""
     sticks: Sticks | None = None
     """A pilot's; None = none are heard."""
+    esc_outputs: tuple[float, float, float, float] | None = None
+    """What the speed controllers report that their motors do; None: what they are told."""
 
     @property
     def has_pilot(self) -> bool:

@@ -209,6 +209,12 @@ CHECKS: tuple[Check, ...] = (
     ),
     Check(
         Part.SYSTEM,
+        lambda r: r.conditions.fd_motor_failure,
+        "Preflight Fail: Motor failure detected",
+        events.MOTOR_FAILED,
+    ),
+    Check(
+        Part.SYSTEM,
         lambda r: r.conditions.geofence.distance and r.settings.gf_action != 0,
         "Geofence violation: exceeding maximum distance to Home",
         events.FENCE_DISTANCE,

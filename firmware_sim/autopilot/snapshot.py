@@ -85,4 +85,5 @@ def snapshot(
         home_yaw=context.home_yaw,
         health=parts.supervisor.health(sample.time_us),
         sticks=context.sticks,
+        esc_outputs=sample.esc_outputs,
     )

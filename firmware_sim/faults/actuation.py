@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from airl_mav.faults.kinds import MOTORS
+from airl_mav.faults.model import Fault
 from airl_mav.profiles.vehicle import Battery
 from airl_mav.vehicle.rotor import command_for, steady_speed
 from firmware_sim.faults.timeline import Acting
@@ -15,9 +16,27 @@ def thrust_left(acting: Sequence[Acting]) -> dict[int, float]:
     """Return the share of its thrust that each failing motor has left, by its index from 0."""
     left: dict[int, float] = {}
     for _, fault, *_ in acting:
+        if fault.kind == "slow":
+            continue
         motor = MOTORS.index(fault.part)
-        left[motor] = left.get(motor, 1.0) * (0.0 if fault.kind == "off" else fault.amount)
+        left[motor] = left.get(motor, 1.0) * _share(fault)
     return left
+
+
+def _share(fault: Fault) -> float:
+    if fault.kind == "off":
+        return 0.0
+    return 1.0 + fault.amount if fault.kind == "mismatch" else fault.amount
+
+
+def slowness(acting: Sequence[Acting]) -> dict[int, float]:
+    """Return the factor of its time constant of each motor that is slow, by its index from 0."""
+    slow: dict[int, float] = {}
+    for _, fault, *_ in acting:
+        if fault.kind == "slow":
+            motor = MOTORS.index(fault.part)
+            slow[motor] = slow.get(motor, 1.0) * fault.amount
+    return slow
 
 
 def weakened(
@@ -27,13 +46,43 @@ def weakened(
 
     Args:
         controls: What the flight controller commands.
-        left: Share of its thrust that each failing motor has left, by its index.
+        left: Share of its thrust that each failing motor has, by its index; more than 1 is more
+            than it should be, up to its greatest thrust.
         thrust_curve: Of the airframe (`vehicle.rotor.steady_speed`).
     """
     motors = list(controls.motors)
     for index, share in left.items():
-        thrust = share * steady_speed(motors[index], thrust_curve) ** 2
+        thrust = min(1.0, share * steady_speed(motors[index], thrust_curve) ** 2)
         motors[index] = command_for(thrust, thrust_curve)
+    first, second, third, fourth = motors
+    return controls._replace(motors=(first, second, third, fourth))
+
+
+def slowed(
+    controls: ActuatorControls,
+    slow: Mapping[int, float],
+    speeds: Sequence[float],
+    lag: float,
+    thrust_curve: float,
+) -> ActuatorControls:
+    """Return the commands after which healthy motors have the speeds that slow ones would have.
+
+    A motor of time constant `k tau` keeps the share `lag^(1/k)` of its speed's error over a tick.
+    A healthy one gets as far in that tick where it is told to go a share of the way: exactly
+    (1 - lag^(1/k)) / (1 - lag) of it.
+
+    Args:
+        controls: What the flight controller commands.
+        slow: Factor k of each slow motor's time constant, by its index.
+        speeds: Of the rotors now, as shares of that at full command.
+        lag: Share of its speed's error that a healthy motor keeps over a tick, exp(-dt / tau).
+        thrust_curve: Of the airframe.
+    """
+    motors = list(controls.motors)
+    for index, factor in slow.items():
+        now, asked = speeds[index], steady_speed(motors[index], thrust_curve)
+        reached = now + (asked - now) * (1.0 - lag ** (1.0 / factor)) / (1.0 - lag)
+        motors[index] = command_for(reached * reached, thrust_curve)
     first, second, third, fourth = motors
     return controls._replace(motors=(first, second, third, fourth))
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 from airl_mav.faults.kinds import MOTORS, SENSORS
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.vehicle.airframe import Airframe
-from firmware_sim.faults.actuation import misread, thrust_left, weakened
+from firmware_sim.faults.actuation import misread, slowed, slowness, thrust_left, weakened
 from firmware_sim.faults.sensors import Effect, effect_of, failed
 from firmware_sim.faults.timeline import Acting, FaultTimeline
 from firmware_sim.faults.wind import Gusts, gust_at
 from firmware_sim.flight_controller import FlightController
 from firmware_sim.interfaces import ActuatorControls, SensorSample
+from firmware_sim.plant.dynamics import Speeds
 from firmware_sim.plant.plant import Plant
 
 
@@ -46,6 +47,9 @@ class FailingParts:
         self._effects: list[tuple[str, Effect]] = []
         self._battery: list[Acting] = []
         self._left: dict[int, float] = {}
+        self._slow: dict[int, float] = {}
+        self._turning: Speeds | None = None
+        """What the motors were last told in effect; None: what the flight controller told them."""
         self._gusts = Gusts(plant.wind)
         plant.wind = self._gusts
         self._wind: list[Acting] = []
@@ -62,8 +66,21 @@ class FailingParts:
             sample = sample._replace(battery=reading)
         if self._wind:
             self._gusts.more = gust_at(self._wind, sample.time_us)
+        if self._turning is not None:
+            sample = sample._replace(esc_outputs=self._turning)
         controls = self._controller.step(sample)
-        return weakened(controls, self._left, self._curve) if self._left else controls
+        if not (self._left or self._slow):
+            self._turning = None
+            return controls
+        if self._left:
+            controls = weakened(controls, self._left, self._curve)
+        if self._slow:
+            plant = self._plant
+            controls = slowed(
+                controls, self._slow, plant.rotor_speeds, plant.rotor_lag, self._curve
+            )
+        self._turning = controls.motors
+        return controls
 
     def _rearrange(self) -> None:
         timeline, before = self._timeline, self._memories
@@ -72,7 +89,8 @@ class FailingParts:
             each.number: before.get(each.number) or self._effect_of(each) for each in sensors
         }
         self._effects = [(each.fault.part, self._memories[each.number]) for each in sensors]
-        self._left = thrust_left(timeline.acting(*MOTORS))
+        motors = timeline.acting(*MOTORS)
+        self._left, self._slow = thrust_left(motors), slowness(motors)
         battery = timeline.acting("battery")
         for each in battery:
             if each.fault.kind == "drop" and each.number not in self._dropped:

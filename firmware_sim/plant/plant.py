@@ -103,7 +103,8 @@ class Plant:
         self._power = np.array(model)
         self._computer_w = computer_w
         self._pack = np.array(pack_row(profile.battery))
-        self._left = lag(airframe, tick_s)
+        self.rotor_lag = lag(airframe, tick_s)
+        """Share of an error of its speed that a rotor keeps over a tick."""
         self._speeds = STOPPED
         self.battery_remaining = asked.battery_charge
         """State of charge, 1 to 0."""
@@ -144,7 +145,7 @@ class Plant:
         # An empty battery turns no motor.
         motors = controls.motors if self.battery_remaining > 0.0 else STOPPED
         speeds, here, force, torque = actuate(
-            self._speeds, motors, before, wind, self._airframe, self._left
+            self._speeds, motors, before, wind, self._airframe, self.rotor_lag
         )
         self._ticks += 1
         # Of the count: not every rate has a period of whole microseconds.

@@ -43,8 +43,14 @@ def _check(
     )
 
 
-def _health(name: str, message: str, component: Component, *extra: Argument) -> CheckEvent:
-    definition = Definition(name, message, _ABOUT + extra, Level.ERROR, group="health")
+def _health(
+    name: str,
+    message: str,
+    component: Component,
+    *extra: Argument,
+    level: Level = Level.ERROR,
+) -> CheckEvent:
+    definition = Definition(name, message, _ABOUT + extra, level, group="health")
     return CheckEvent(definition, component, (0,) * len(extra))
 
 
@@ -125,6 +131,9 @@ PITCHED = _check(
     _SYSTEM,
     _L.CRITICAL,
     "Pitch exceeds <param>FD_FAIL_P</param>.",
+)
+MOTOR_FAILED = _health(
+    "check_failure_detector_motor", "Motor failure detected", _C.MOTORS_ESCS, level=_L.CRITICAL
 )
 FENCE_DISTANCE = _check(
     "check_gf_violation_max_hor_dist",

@@ -374,11 +374,12 @@ TABLE: tuple[Row, ...] = (
     Row(
         Trigger.MOTOR,
         "Motor failure",
-        "what measures the motors reports that one does not do what it is told",
+        "a motor draws too little current for what it is told",
         lambda s: s.conditions.fd_motor_failure,
         _ACTUATOR,
         "COM_ACT_FAIL_ACT",
         _WARN,
+        related=("FD_ACT_EN", "FD_ACT_MOT_THR", "FD_ACT_MOT_C2T", "FD_ACT_MOT_TOUT"),
     ),
 )
 """Every failsafe but the last, which `answers` adds: the fallback of a mode that cannot fly on."""

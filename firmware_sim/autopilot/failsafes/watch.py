@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from airl_mav.control.mixer import Motors
 from airl_mav.core.constants import US_PER_S
 from firmware_sim.autopilot.autopilot_state import Message, Setpoint, Severity
 from firmware_sim.autopilot.commander import Phase
@@ -20,6 +21,7 @@ from firmware_sim.autopilot.failsafes.conditions import (
 )
 from firmware_sim.autopilot.failsafes.detectors import AttitudeFailure, Validity
 from firmware_sim.autopilot.failsafes.endurance import Endurance
+from firmware_sim.autopilot.failsafes.motor_failure import MotorFailure, Undercurrent
 from firmware_sim.autopilot.sensor_monitor import SensorMonitor
 from firmware_sim.interfaces import BatterySample, SensorSample
 
@@ -39,8 +41,6 @@ class Reports:
     mission_finished: bool = False
     navigator_failure: bool = False
     """What the mode flies to cannot be reached."""
-    motor_failure: bool = False
-    """A motor does not do what it is told."""
     return_time_s: float = 0.0
     """How long a return would take, with its margins; 0 = not known."""
 
@@ -60,6 +60,10 @@ class WatchSettings(NamedTuple):
     com_pos_low_eph: float = -1.0
     com_rc_loss_t: float = 0.5
     com_vel_fs_evh: float = 1.0
+    fd_act_en: float = 1.0
+    fd_act_mot_c2t: float = 2.0
+    fd_act_mot_thr: float = 0.2
+    fd_act_mot_tout: float = 100.0
     fd_fail_p: float = 60.0
     fd_fail_p_ttri: float = 0.3
     fd_fail_r: float = 60.0
@@ -83,6 +87,8 @@ class Watch:
         """The sensors, watched."""
         self.attitude = AttitudeFailure()
         """The failure detector."""
+        self.motors = MotorFailure()
+        """The failure detector's motors."""
         self.reports = Reports()
         """What others report."""
         self._setpoint_us: int | None = None
@@ -126,6 +132,13 @@ class Watch:
         by_position = not math.isnan(setpoint.position[0])
         return not (self._local if by_position else self._velocity).valid
 
+    def hear_escs(self, time_us: int, told: Motors, outputs: Motors) -> None:
+        """Note what the speed controllers report that their motors do, and what they are told."""
+        p = self.settings
+        if p.fd_act_en:
+            limits = Undercurrent(p.fd_act_mot_thr, p.fd_act_mot_c2t, p.fd_act_mot_tout)
+            self.motors.take(time_us, told, outputs, limits)
+
     def look(self, sample: SensorSample, phase: Phase) -> tuple[Conditions, list[Message]]:
         """Return what is wrong now, and what has changed that an operator is told at once."""
         texts = self.sensors.judge(sample, flying=phase is _AIR)
@@ -141,6 +154,8 @@ class Watch:
             self._takeoff_us = now_us if self._takeoff_us is None else self._takeoff_us
         elif not armed:
             self._takeoff_us = None
+        if not armed:
+            self.motors.rest()
         accuracy, speed_accuracy = estimator.accuracy()
         position = estimator.knows_position(now_us, flying=phase is _AIR)
         needed = p.com_pos_fs_eph if p.com_pos_fs_eph >= 0.0 else math.inf
@@ -188,7 +203,7 @@ class Watch:
                 (p.fd_fail_r, p.fd_fail_p),
                 (p.fd_fail_r_ttri, p.fd_fail_p_ttri),
             ),
-            fd_motor_failure=reports.motor_failure,
+            fd_motor_failure=self.motors.failed,
         )
 
     def _texts(self, conditions: Conditions, now_us: int, phase: Phase) -> list[Message]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from firmware_sim.autopilot import esc
 from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState
 from firmware_sim.mavlink.codec import Values, dialect
 from firmware_sim.mavlink.px4_custom_mode import base_mode
@@ -15,11 +16,6 @@ _OUTPUTS = 16
 
 _OUTPUT_FIELDS = 32
 """Slots of ACTUATOR_OUTPUT_STATUS."""
-
-_ESC_RPM, _ESC_IDLE_A, _ESC_SPAN_A = 6_000, 1.0, 15.0
-_ESC_IDLE_C, _ESC_SPAN_C = 20.0, 40.0
-"""Speed [rpm], current [A] and temperature [°C] of a speed controller, by the command 0..1.
-Source: PX4 1.16, SimulatorMavlink::send_esc_telemetry: it has no model of them."""
 
 _NO_FAILURES = (0, 0, 0, 0)
 _FIRST_ESC = 0
@@ -47,7 +43,7 @@ def hil_actuator_controls(state: AutopilotState) -> Values:
 def esc_info(state: AutopilotState) -> Values:
     """Four speed controllers, all of them on line; temperature [0.01 °C]."""
     counter, online = 0, (1 << _ESCS) - 1
-    temperature = (units.int16((_ESC_IDLE_C + _ESC_SPAN_C * u) * 100.0) for u in _commands(state))
+    temperature = (units.int16((esc.IDLE_C + esc.SPAN_C * u) * 100.0) for u in _outputs_of(state))
     return (
         *(_FIRST_ESC, state.time_us, counter, _ESCS),
         *(dialect.ESC_CONNECTION_TYPE_PPM, online),
@@ -59,14 +55,26 @@ def esc_info(state: AutopilotState) -> Values:
 
 def esc_status(state: AutopilotState) -> Values:
     """Speed [rpm], voltage [V] and current [A] of four speed controllers."""
-    commands = _commands(state)
-    armed = _armed(state)
+    outputs = _outputs_of(state)
     return (
         *(_FIRST_ESC, state.time_us),
-        *(round(_ESC_RPM * u) for u in commands),
+        *(round(esc.RPM * u) for u in outputs),
         *(state.battery.voltage_v,) * _ESCS,
-        *(_ESC_IDLE_A + _ESC_SPAN_A * u if armed else 0.0 for u in commands),
+        *_currents_a(state, outputs),
     )
+
+
+def _outputs_of(state: AutopilotState) -> tuple[float, ...]:
+    """Return what the motors do: what they are told, where nothing else is known."""
+    commands = _commands(state)
+    return commands if state.esc_outputs is None else state.esc_outputs
+
+
+def _currents_a(state: AutopilotState, outputs: tuple[float, ...]) -> tuple[float, ...]:
+    if state.esc_outputs is None and _armed(state):
+        # As PX4 has it: armed, a motor draws its idle current, turning or not.
+        return tuple(esc.IDLE_A + esc.SPAN_A * u for u in outputs)
+    return tuple(esc.current_a(u) for u in outputs)
 
 
 def _outputs(state: AutopilotState) -> Values:
