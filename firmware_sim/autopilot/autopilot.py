@@ -28,7 +28,8 @@ from firmware_sim.autopilot.commander import (
     Flight,
     Phase,
 )
-from firmware_sim.autopilot.estimator import Estimator, NewFilter
+from firmware_sim.autopilot.error_filter import NewFilter
+from firmware_sim.autopilot.estimator import Estimator
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.events.definition import Event as Told
 from firmware_sim.autopilot.failsafes.framework import Intervention

@@ -138,12 +138,18 @@ class Compass:
 
     def __init__(self) -> None:
         self.given_up = False
+        self._failed = False
         self._refused_us: int | None = None
         self._gate_rad = 0.0
 
     def admits(self, innovation_rad: float) -> bool:
         """Return whether a heading may be fused, if it passes the gate too."""
-        return not self.given_up or abs(innovation_rad) <= self._gate_rad
+        near = not self.given_up or abs(innovation_rad) <= self._gate_rad
+        return near and not self._failed
+
+    def fail(self) -> None:
+        """Give it up for good: the vehicle has been seen to point elsewhere."""
+        self.given_up = self._failed = True
 
     def tested(self, innovation_rad: float, ratio: float, time_us: int) -> None:
         """Note the test ratio of a heading: beyond 1 it was refused."""
@@ -208,7 +214,7 @@ class Consistency:
         ]
         if not any(lasted):
             return None
-        return self._restart(restart_for(float(np.abs(innovation).max()), max(lasted)), time_us)
+        return self._anew(restart_for(float(np.abs(innovation).max()), max(lasted)))
 
     def heading(self, deviations: float, time_us: int, *, within: bool) -> Restart | None:
         """Take a heading's innovation in standard deviations, and whether it is within the gate.
@@ -219,12 +225,15 @@ class Consistency:
         if not within and self._heading.length == 0:
             return None
         lasted = self._heading.take(deviations, time_us)
-        return self._restart(restart_for(0.0, lasted), time_us) if lasted else None
+        return self._anew(restart_for(0.0, lasted)) if lasted else None
 
-    def _restart(self, restart: Restart, time_us: int) -> Restart:
+    def restarted(self, time_us: int) -> None:
+        """Note that the filter was restarted with what was returned."""
+        self.restarts += 1
+        self.restarted_us = time_us
+
+    def _anew(self, restart: Restart) -> Restart:
         for run in (*self._runs, self._heading):
             run.restart()
         self._before = None
-        self.restarts += 1
-        self.restarted_us = time_us
         return restart

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Protocol
 
 import numpy as np
 
@@ -26,9 +25,13 @@ from airl_mav.vehicle.atmosphere import altitude_m
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.autopilot_state import Estimate
 from firmware_sim.autopilot.consistency import Compass, Consistency, Restart
+from firmware_sim.autopilot.emergency_yaw import EmergencyYaw, turn_to
+from firmware_sim.autopilot.error_filter import NewFilter
 from firmware_sim.autopilot.filter_kernel import KernelFilter
 from firmware_sim.autopilot.fusion_horizon import FusionHorizon
 from firmware_sim.autopilot.magnetic_field import FieldCheck
+from firmware_sim.autopilot.measurement import Measurement, selecting
+from firmware_sim.autopilot.yaw_estimator import YawEstimator
 from firmware_sim.interfaces import GpsFix, SensorSample
 
 ALIGN_S = 0.5
@@ -60,62 +63,6 @@ BARO_WALK_M_SQRT_S = 0.01
 """Process noise of the barometer's offset [m/sqrt(s)]."""
 
 
-class ErrorFilter(Protocol):
-    """Carries the covariance of the error, and moves corrections into the nominal state.
-
-    The nominal state is a row of `error_state.ROW_SIZE` floats, updated in place.
-    """
-
-    @property
-    def covariance(self) -> Vector:
-        """Of the error, (16, 16)."""
-        ...
-
-    def predict(self, state: Vector, gyro: Vector, accel: Vector) -> None:
-        """Move nominal state and covariance by one tick's IMU sample, each (3,) FRD."""
-        ...
-
-    def restart(self, covariance: Vector) -> None:
-        """Go on from another covariance (16, 16): what was known is so no longer."""
-        ...
-
-    def fuse(self, state: Vector, innovation: Vector, h: Vector, variance: Vector) -> float:
-        """Correct the nominal state by one measurement, unless it fails the gate.
-
-        Args:
-            state: Nominal state.
-            innovation: Measured less expected (m,).
-            h: Jacobian of what is expected by the error (m, 16).
-            variance: Of the independent noises (m,).
-
-        Returns:
-            The test ratio: 1 = at the gate; above it, or NaN, nothing was corrected.
-        """
-        ...
-
-
-NewFilter = Callable[[Vector, Vector], ErrorFilter]
-"""Makes a filter from the first covariance (16, 16) and what each tick adds to its diagonal."""
-
-
-class Measurement:
-    """Buffers of one kind of measurement: innovation, its variance and Jacobian."""
-
-    def __init__(self, name: str, ratio: int, h: Vector) -> None:
-        """Allocate them: `ratio` is its index in the estimate's ratios, h the Jacobian (m, 16)."""
-        self.name = name
-        self.slot = es.RATIO + ratio
-        self.h = h
-        self.innovation, self.variance = np.zeros(len(h)), np.zeros(len(h))
-        self.fused_us: int | None = None
-        """When one was last within the gate; None = never."""
-
-
-def _selecting(*errors: int) -> Vector:
-    """Return the Jacobian of a sensor that measures these states themselves."""
-    return np.eye(es.N_STATES)[list(errors)]
-
-
 class Estimator:
     """Turns noisy sensors into position, velocity, attitude and biases; never sees the truth."""
 
@@ -141,16 +88,22 @@ class Estimator:
         self._time_us = 0
         self._aligned_us: int | None = None
         self._estimate: Estimate | None = None
-        horizontal = _selecting(es.POS, es.POS + 1, es.VEL, es.VEL + 1)
+        horizontal = selecting(es.POS, es.POS + 1, es.VEL, es.VEL + 1)
         self._gps_horizontal = Measurement("gps_horizontal", 0, horizontal)
-        self._gps_vertical = Measurement("gps_vertical", 3, _selecting(es.POS + 2, es.VEL + 2))
-        self._baro = Measurement("baro", 1, _selecting(es.BARO) - _selecting(es.POS + 2))
+        self._gps_vertical = Measurement("gps_vertical", 3, selecting(es.POS + 2, es.VEL + 2))
+        self._baro = Measurement("baro", 1, selecting(es.BARO) - selecting(es.POS + 2))
         self._heading = Measurement("heading", 2, np.zeros((1, es.N_STATES)))
         self.consistency = Consistency()
         """Sees inertial sensors that have gone wrong."""
         self.compass = Compass()
         """Whether the compass is believed."""
         self._horizon = FusionHorizon()
+        self.yaw = YawEstimator()
+        """The heading without a compass."""
+        self.flying = False
+        """Whether the vehicle is in the air; set by whoever knows."""
+        self.emergency = EmergencyYaw()
+        """When it is taken over."""
         self._field: Vector | None = None
         """The newest that the compass has measured (3,) FRD [gauss]; before alignment the mean."""
 
@@ -161,6 +114,7 @@ class Estimator:
             self._align(sample)
         else:
             self._predict(sample)
+            self.yaw.feel(sample.gyro, sample.accel)
             if sample.gps is not None:
                 self._fuse_gps(sample.gps, self.origin)
             if sample.pressure_hpa is not None:
@@ -323,7 +277,13 @@ class Estimator:
         measured, value = geodetic_to_local(fix.position, origin), self._value
         r_p, r_v = value("EKF2_GPS_P_NOISE") ** 2, value("EKF2_GPS_V_NOISE") ** 2
         self._horizon.assume(value("EKF2_GPS_DELAY"))
-        r_v = self._check_velocity(fix.velocity_ned - self._then()[3:], r_v)
+        self._observe_yaw(fix.velocity_ned, math.sqrt(r_v))
+        r_v, restart = self._check_velocity(fix.velocity_ned - self._then()[3:], r_v)
+        self._answer(restart)
+        if self._suspects_heading and self.emergency.is_due(
+            self._time_us, self.yaw, self._gps_horizontal.fused_us
+        ):
+            self._reset_heading(measured, fix.velocity_ned, r_p, r_v)
         m, then = self._gps_horizontal, self._then()
         m.innovation[:2] = measured[:2] - then[:2]
         m.innovation[2:] = fix.velocity_ned[:2] - then[3:5]
@@ -335,6 +295,13 @@ class Estimator:
         # A receiver's height is about half as good as its horizontal position.
         m.variance[0], m.variance[1] = max(fix.epv_m, math.sqrt(r_p)) ** 2, r_v
         self._fuse(m)
+
+    def _observe_yaw(self, velocity: Vector, accuracy: float) -> None:
+        state = self.state
+        if self._horizon.is_past:
+            velocity = velocity + state[es.V : es.Q] - self._then()[3:]
+        bias = state[es.GYRO_BIAS : es.ACCEL_BIAS]
+        self.yaw.observe(velocity, accuracy, bias, flying=self.flying)
 
     def _then(self) -> Vector:
         """Return position and velocity (6,) NED when a fix of now was measured."""
@@ -361,24 +328,48 @@ class Estimator:
         ratio = self.state.item(m.slot)
         self.compass.tested(innovation, ratio, self._time_us)
         deviations = math.copysign(es.GATE * ratio, innovation)
-        restart = self.consistency.heading(deviations, self._time_us, within=ratio <= 1.0)
-        self._restart(restart)
+        self._answer(self.consistency.heading(deviations, self._time_us, within=ratio <= 1.0))
 
     # --- inertial sensors that have gone wrong
 
-    def _check_velocity(self, innovation: Vector, variance: float) -> float:
-        """Restart the filter where it must; return the variance of the measured velocity."""
+    def _check_velocity(self, innovation: Vector, variance: float) -> tuple[float, Restart | None]:
+        """Return the variance of a measured velocity, and what to restart the filter with."""
         excess = self.consistency.velocity_excess
         sigma = np.sqrt(self.filter.covariance.diagonal()[es.VEL : es.ATT] + variance)
         acceleration = self.state[es.ACCELERATION : es.SIGMA]
         restart = self.consistency.velocity(innovation, sigma, acceleration, self._time_us)
-        self._restart(restart)
-        return variance * excess
+        return variance * excess, restart
 
-    def _restart(self, restart: Restart | None) -> None:
-        """Let the filter learn anew what inertial sensors make wrong; None = it goes on."""
+    @property
+    def _suspects_heading(self) -> bool:
+        return self.flying and self.emergency.is_suspected(self.state, self.yaw)
+
+    def _answer(self, restart: Restart | None) -> None:
+        """Restart the filter, unless the heading explains what it would be restarted for."""
         if restart is None:
             return
+        if self._suspects_heading:
+            self.emergency.doubt(self._time_us)
+        else:
+            self._restart(restart)
+
+    def _reset_heading(self, place: Vector, velocity: Vector, r_p: float, r_v: float) -> None:
+        """Take over the yaw estimator's heading and the GPS's motion, and give up the compass."""
+        state, then = self.state, self._then().copy()
+        covariance = turn_to(state, self.filter.covariance, self.yaw.yaw, self.yaw.variance)
+        state[es.P : es.P + 2] += place[:2] - then[:2]
+        state[es.V : es.Q] += velocity - then[3:]
+        for i in range(2):
+            covariance[es.POS + i, es.POS + i] = r_p
+        for i in range(3):
+            covariance[es.VEL + i, es.VEL + i] = r_v
+        self.filter.restart(covariance)
+        self.compass.fail()
+        self.emergency.resets += 1
+
+    def _restart(self, restart: Restart) -> None:
+        """Let the filter learn anew what inertial sensors make wrong."""
+        self.consistency.restarted(self._time_us)
         variances = self.filter.covariance.diagonal().copy()
         for first, sigma in (
             (es.VEL, restart.velocity_m_s),

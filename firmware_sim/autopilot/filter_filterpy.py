@@ -14,7 +14,7 @@ from firmware_sim.autopilot.error_state import N_STATES, gate_ratio, inject, pro
 
 
 class FilterpyFilter:
-    """Implements `estimator.ErrorFilter`."""
+    """Implements `error_filter.ErrorFilter`."""
 
     def __init__(self, covariance: Vector, noise: Vector) -> None:
         """Start with a covariance (16, 16); variances `noise` (16,) are added at every tick."""

@@ -107,7 +107,7 @@ def _spread(p: Vector, row: Vector, out: Vector) -> float:
 
 
 class KernelFilter:
-    """Implements `estimator.ErrorFilter`."""
+    """Implements `error_filter.ErrorFilter`."""
 
     def __init__(self, covariance: Vector, noise: Vector) -> None:
         """Start with a covariance (16, 16); variances `noise` (16,) are added at every tick."""

@@ -150,6 +150,7 @@ class Watch:
         now_us, p, reports = sample.time_us, self.settings, self.reports
         estimator = self._estimator
         armed = phase >= _GROUND
+        estimator.flying = phase is _AIR
         if phase is _AIR:
             self._takeoff_us = now_us if self._takeoff_us is None else self._takeoff_us
         elif not armed:

@@ -1,0 +1,338 @@
+"""The yaw estimator: what heading the IMU and GPS velocities alone say, without a compass.
+
+A Gaussian sum of five small filters whose headings begin evenly spread around the circle. Each has
+an attitude of its own by the IMU (a complementary filter levels it), and three states: velocity
+north and east, and heading. GPS velocities correct them, and weigh them by how well each foretold
+them. Nothing is known of the heading until the vehicle accelerates; then one hypothesis outlives
+the others.
+
+It runs beside the estimator's filter, corrects nothing there, and is asked only where the two no
+longer agree with the GPS (`estimator`).
+
+Source: PX4 1.16, src/modules/ekf2/EKF/yaw_estimator/EKFGSF_yaw.cpp, and its constants. The airspeed
+by which it corrects a fixed wing's turns (EKF2_GSF_TAS) has no place on a multicopter. PX4 hands it
+the variance of the velocity where it takes a standard deviation; here it is given the latter.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from airl_mav.core.constants import GRAVITY_M_S2, TICK_S
+from airl_mav.core.frames import Vector
+from airl_mav.core.kernels import kernel, large_kernel
+from airl_mav.vehicle.rotation import (
+    Quat,
+    Vec,
+    conjugate,
+    exponential,
+    multiply,
+    normalize,
+    rotate,
+    yaw_of,
+)
+
+N_MODELS = 5
+TILT_GAIN = 0.2
+"""From the tilt's error to the correction of the rates [1/s]."""
+GYRO_BIAS_GAIN = 0.04
+"""From the tilt's correction to the gyro's bias [1/s]."""
+ACCEL_NOISE = 2.0
+"""[m/s²]"""
+GYRO_NOISE = 0.1
+"""[rad/s]"""
+BIAS_LIMIT = 0.05
+"""Greatest bias of a gyro [rad/s]."""
+SLOW_TURN = math.radians(10.0)
+"""The gyro's bias is learnt while the vehicle turns more slowly [rad/s]."""
+ACCEL_FILTER = 10.0
+"""How much faster than the tilt's correction the accelerometer is smoothed."""
+ALIGN_SHARE = 0.1
+"""The tilt is aligned while the specific force differs by less than this share from gravity."""
+LEAST_ACCURACY_M_S = 0.01
+LEAST_VARIANCE = 1e-6
+LEAST_WEIGHT = 1e-5
+NIS_LIMIT = 25.0
+"""Innovations count as no more than five standard deviations."""
+
+# A model's row: velocity north, east, heading; their covariance's upper triangle; attitude body to
+# world; gyro bias; weight.
+X, YAW, P_NN, P_NE, P_NY, P_EE, P_EY, P_YY, ATTITUDE, BIAS, WEIGHT = (
+    0,
+    2,
+    3,
+    4,
+    5,
+    6,
+    7,
+    8,
+    9,
+    13,
+    16,
+)
+MODEL_SIZE = 17
+
+# What the models share: smoothed specific force (3) [m/s²], whether the tilt is aligned, whether
+# velocities are fused, and the result: heading [rad] and its variance [rad²].
+FORCE, ALIGNED, STARTED, RESULT, VARIANCE = 0, 3, 4, 5, 6
+SHARED_SIZE = 7
+
+LONGEST = 64
+"""Samples of the IMU that are kept until they are predicted: 0.25 s."""
+
+
+@kernel
+def _accel_gain(force_norm: float) -> float:
+    """Return the gain of the tilt's correction [1/s]: none where the vehicle accelerates."""
+    off = abs(force_norm - GRAVITY_M_S2) / GRAVITY_M_S2
+    rest = 1.0 - min(2.0 * off, 1.0)
+    return TILT_GAIN * rest * rest
+
+
+@kernel
+def _quat(m: Vector) -> Quat:
+    return m[ATTITUDE], m[ATTITUDE + 1], m[ATTITUDE + 2], m[ATTITUDE + 3]
+
+
+@kernel
+def _put(m: Vector, q: Quat) -> None:
+    m[ATTITUDE], m[ATTITUDE + 1], m[ATTITUDE + 2], m[ATTITUDE + 3] = normalize(q)
+
+
+@kernel
+def _turn(m: Vector, angle: float) -> None:
+    """Turn a model's attitude about the world's down axis."""
+    _put(m, multiply((math.cos(0.5 * angle), 0.0, 0.0, math.sin(0.5 * angle)), _quat(m)))
+
+
+@kernel
+def _level(m: Vector, gyro: Vec, force: Vec, dt: float) -> None:
+    """Move a model's attitude by the gyro, and its tilt towards the smoothed specific force."""
+    norm = math.sqrt(force[0] * force[0] + force[1] * force[1] + force[2] * force[2])
+    gain = _accel_gain(norm)
+    down = rotate(conjugate(_quat(m)), (0.0, 0.0, 1.0))
+    share = gain / norm if gain > 0.0 else 0.0
+    tilt = (
+        share * (down[1] * force[2] - down[2] * force[1]),
+        share * (down[2] * force[0] - down[0] * force[2]),
+        share * (down[0] * force[1] - down[1] * force[0]),
+    )
+    spin2 = 0.0
+    for i in range(3):
+        spin2 += (gyro[i] - m[BIAS + i]) ** 2
+    if spin2 < SLOW_TURN * SLOW_TURN:
+        for i in range(3):
+            bias = m[BIAS + i] - tilt[i] * GYRO_BIAS_GAIN * dt
+            m[BIAS + i] = min(max(bias, -BIAS_LIMIT), BIAS_LIMIT)
+    turn = exponential(
+        (
+            (gyro[0] + tilt[0] - m[BIAS]) * dt,
+            (gyro[1] + tilt[1] - m[BIAS + 1]) * dt,
+            (gyro[2] + tilt[2] - m[BIAS + 2]) * dt,
+        )
+    )
+    _put(m, multiply(_quat(m), turn))
+
+
+@kernel
+def _predict(m: Vector, accel: Vec, dt: float) -> None:
+    """Move a model's velocity and heading, and their covariance P = F P F' + Q.
+
+    Of F only the column of the heading differs from the identity's: a heading error turns the
+    change of velocity.
+    """
+    q = _quat(m)
+    m[YAW] = yaw_of(q)
+    north, east, _ = rotate(q, (accel[0] * dt, accel[1] * dt, accel[2] * dt))
+    by_n, by_e = -east, north
+    ny = m[P_NY] + by_n * m[P_YY]
+    ey = m[P_EY] + by_e * m[P_YY]
+    moved = (ACCEL_NOISE * dt) ** 2
+    m[P_NN] = max(m[P_NN] + by_n * (m[P_NY] + ny) + moved, LEAST_VARIANCE)
+    m[P_NE] += by_e * m[P_NY] + by_n * ey
+    m[P_EE] = max(m[P_EE] + by_e * (m[P_EY] + ey) + moved, LEAST_VARIANCE)
+    m[P_NY], m[P_EY] = ny, ey
+    m[P_YY] = max(m[P_YY] + (GYRO_NOISE * dt) ** 2, LEAST_VARIANCE)
+    m[X] += north
+    m[X + 1] += east
+
+
+@large_kernel
+def advance(models: Vector, shared: Vector, gyro: Vector, accel: Vector, dt: float) -> None:
+    """Move all models by samples of the IMU.
+
+    Args:
+        models: (N_MODELS, MODEL_SIZE), updated.
+        shared: (SHARED_SIZE,), updated.
+        gyro: Samples (3 n,), FRD [rad/s].
+        accel: Samples (3 n,), specific force FRD [m/s²].
+        dt: Time step [s].
+    """
+    share = min(ACCEL_FILTER * dt * TILT_GAIN, 1.0)
+    low, high = (1.0 - ALIGN_SHARE) * GRAVITY_M_S2, (1.0 + ALIGN_SHARE) * GRAVITY_M_S2
+    for k in range(0, len(gyro), 3):
+        a = (accel[k], accel[k + 1], accel[k + 2])
+        for i in range(3):
+            shared[FORCE + i] += share * (a[i] - shared[FORCE + i])
+        force = (shared[FORCE], shared[FORCE + 1], shared[FORCE + 2])
+        if shared[ALIGNED] == 0.0:
+            now2 = a[0] * a[0] + a[1] * a[1] + a[2] * a[2]
+            mean2 = force[0] * force[0] + force[1] * force[1] + force[2] * force[2]
+            if not (low * low < now2 < high * high and low * low < mean2 < high * high):
+                continue
+            roll = math.atan2(-a[1], -a[2])
+            pitch = math.atan2(a[0], math.sqrt(a[1] * a[1] + a[2] * a[2]))
+            level = multiply(exponential((0.0, pitch, 0.0)), exponential((roll, 0.0, 0.0)))
+            for j in range(N_MODELS):
+                _put(models[j], level)
+            shared[ALIGNED] = 1.0
+        w = (gyro[k], gyro[k + 1], gyro[k + 2])
+        for j in range(N_MODELS):
+            _level(models[j], w, force, dt)
+            if shared[STARTED] != 0.0:
+                _predict(models[j], a, dt)
+
+
+@kernel
+def _start(models: Vector, shared: Vector, north: float, east: float, variance: float) -> None:
+    """Spread the headings around the circle, all as probable."""
+    step = 2.0 * math.pi / N_MODELS
+    for j in range(N_MODELS):
+        m = models[j]
+        yaw = -math.pi + (j + 0.5) * step
+        _turn(m, yaw - yaw_of(_quat(m)))
+        m[:ATTITUDE] = 0.0
+        m[X], m[X + 1], m[YAW] = north, east, yaw
+        m[P_NN] = m[P_EE] = variance
+        m[P_YY] = (0.5 * step) ** 2
+        m[WEIGHT] = 1.0 / N_MODELS
+    shared[STARTED], shared[RESULT], shared[VARIANCE] = 1.0, 0.0, (0.5 * math.pi) ** 2
+
+
+@kernel
+def _correct(m: Vector, north: float, east: float, variance: float) -> float:
+    """Fuse a velocity into a model; return the density of its innovation."""
+    s_nn, s_ne, s_ee = m[P_NN] + variance, m[P_NE], m[P_EE] + variance
+    determinant = s_nn * s_ee - s_ne * s_ne
+    i_nn, i_ne, i_ee = s_ee / determinant, -s_ne / determinant, s_nn / determinant
+    d_n, d_e = north - m[X], east - m[X + 1]
+    nis = d_n * d_n * i_nn + 2.0 * d_n * d_e * i_ne + d_e * d_e * i_ee
+    if nis > NIS_LIMIT:
+        shorter = math.sqrt(NIS_LIMIT / nis)
+        d_n, d_e, nis = d_n * shorter, d_e * shorter, NIS_LIMIT
+    p_nn, p_ne, p_ny, p_ee, p_ey = m[P_NN], m[P_NE], m[P_NY], m[P_EE], m[P_EY]
+    k_nn, k_ne = p_nn * i_nn + p_ne * i_ne, p_nn * i_ne + p_ne * i_ee
+    k_en, k_ee = p_ne * i_nn + p_ee * i_ne, p_ne * i_ne + p_ee * i_ee
+    k_yn, k_ye = p_ny * i_nn + p_ey * i_ne, p_ny * i_ne + p_ey * i_ee
+    m[P_NN] = max(p_nn - k_nn * p_nn - k_ne * p_ne, LEAST_VARIANCE)
+    m[P_NE] = p_ne - k_nn * p_ne - k_ne * p_ee
+    m[P_NY] = p_ny - k_nn * p_ny - k_ne * p_ey
+    m[P_EE] = max(p_ee - k_en * p_ne - k_ee * p_ee, LEAST_VARIANCE)
+    m[P_EY] = p_ey - k_en * p_ny - k_ee * p_ey
+    m[P_YY] = max(m[P_YY] - k_yn * p_ny - k_ye * p_ey, LEAST_VARIANCE)
+    m[X] += k_nn * d_n + k_ne * d_e
+    m[X + 1] += k_en * d_n + k_ee * d_e
+    turned = k_yn * d_n + k_ye * d_e
+    m[YAW] = (m[YAW] + turned + math.pi) % (2.0 * math.pi) - math.pi
+    _turn(m, turned)
+    return math.exp(-0.5 * nis) / (2.0 * math.pi * math.sqrt(determinant))
+
+
+@large_kernel
+def fuse(models: Vector, shared: Vector, north: float, east: float, accuracy: float) -> None:
+    """Fuse a GPS velocity, and write heading and variance of the sum.
+
+    Args:
+        models: (N_MODELS, MODEL_SIZE), updated.
+        shared: (SHARED_SIZE,), updated.
+        north: Velocity [m/s].
+        east: Velocity [m/s].
+        accuracy: Standard deviation of each [m/s].
+    """
+    if shared[ALIGNED] == 0.0:
+        return
+    variance = max(accuracy, LEAST_ACCURACY_M_S) ** 2
+    if shared[STARTED] == 0.0:
+        _start(models, shared, north, east, variance)
+        return
+    total = 0.0
+    for j in range(N_MODELS):
+        density = _correct(models[j], north, east, variance)
+        models[j, WEIGHT] = max(models[j, WEIGHT] * density, LEAST_WEIGHT)
+        total += models[j, WEIGHT]
+    ahead = aside = 0.0
+    for j in range(N_MODELS):
+        m = models[j]
+        m[WEIGHT] /= total
+        ahead += m[WEIGHT] * math.cos(m[YAW])
+        aside += m[WEIGHT] * math.sin(m[YAW])
+    yaw, spread = math.atan2(aside, ahead), 0.0
+    for j in range(N_MODELS):
+        m = models[j]
+        off = (m[YAW] - yaw + math.pi) % (2.0 * math.pi) - math.pi
+        spread += m[WEIGHT] * (m[P_YY] + off * off)
+    shared[RESULT], shared[VARIANCE] = yaw, spread
+    if not (math.isfinite(spread) and spread > 0.0):
+        shared[STARTED], shared[VARIANCE] = 0.0, math.inf
+
+
+class YawEstimator:
+    """Heading by IMU and GPS velocity.
+
+    Samples of the IMU are kept until a fix needs them: predicting them together costs a tenth of
+    predicting each at its time, and comes to the same.
+    """
+
+    def __init__(self) -> None:
+        """Begin without a tilt."""
+        self.models = np.zeros((N_MODELS, MODEL_SIZE))
+        """(N_MODELS, MODEL_SIZE)"""
+        self.models[:, ATTITUDE] = 1.0
+        self._shared = np.zeros(SHARED_SIZE)
+        self._shared[VARIANCE] = math.inf
+        self._gyro: list[Vector] = []
+        self._accel: list[Vector] = []
+
+    @property
+    def yaw(self) -> float:
+        """Heading [rad]; means something where the variance is small."""
+        return self._shared.item(RESULT)
+
+    @property
+    def variance(self) -> float:
+        """Of the heading [rad²]; infinite before velocities are fused."""
+        return self._shared.item(VARIANCE)
+
+    def feel(self, gyro: Vector, accel: Vector) -> None:
+        """Take a tick's sample of the IMU, each (3,) FRD [rad/s], [m/s²]; kept, not copied."""
+        self._gyro.append(gyro)
+        self._accel.append(accel)
+        if len(self._gyro) >= LONGEST:
+            self._advance()
+
+    def observe(
+        self, velocity: Vector, accuracy: float, gyro_bias: Vector, *, flying: bool
+    ) -> None:
+        """Take a GPS velocity; on the ground, where it says nothing, begin anew.
+
+        Args:
+            velocity: NED (3,) [m/s].
+            accuracy: Standard deviation of an axis [m/s].
+            gyro_bias: What the estimator knows of it (3,) [rad/s], taken over on the ground.
+            flying: Whether the vehicle is in the air.
+        """
+        self._advance()
+        if flying:
+            fuse(self.models, self._shared, velocity.item(0), velocity.item(1), accuracy)
+            return
+        self._shared[STARTED], self._shared[VARIANCE] = 0.0, math.inf
+        self.models[:, BIAS : BIAS + 3] = gyro_bias
+
+    def _advance(self) -> None:
+        if self._gyro:
+            gyro, accel = np.concatenate(self._gyro), np.concatenate(self._accel)
+            self._gyro.clear()
+            self._accel.clear()
+            advance(self.models, self._shared, gyro, accel, TICK_S)
