@@ -21,7 +21,7 @@ from rich.table import Table
 
 from airl_mav.experiments.quantisation import export_int8
 from airl_mav.policy.card import ONNX_FILE, PolicyFacts, load_card, read_card
-from airl_mav.policy.layouts import DEPTH, Encoded, ObservationSpec, boxes
+from airl_mav.policy.layouts import Encoded, ObservationSpec, boxes
 from airl_mav.policy.quantised import quantised
 from airl_mav.policy.registry import find_policy
 from airl_mav.policy.runtime import OnnxRuntime
@@ -72,7 +72,7 @@ def pair_of(name: str, scratch: Path) -> tuple[Path, Path, ObservationSpec]:
 def noise(spec: ObservationSpec, n: int, rng: np.random.Generator) -> Encoded:
     return {
         key: rng.integers(0, 256, (n, *box.shape), np.uint8)
-        if key == DEPTH
+        if key == "depth"
         else rng.normal(0.0, 0.5, (n, *box.shape)).astype(np.float32)
         for key, box in boxes(spec).items()
     }

@@ -27,7 +27,7 @@ from airl_mav.black_box.messages import (
     Resources,
     Status,
     Telemetry,
-    depth_image,
+    image_message,
     text,
 )
 from airl_mav.black_box.writing import BlackBoxFile
@@ -209,7 +209,7 @@ class BlackBoxRecorder:
         if told.started_us >= self._next_image_us:
             self._next_image_us = told.started_us + self._image_us
             seen_us = told.seen.received_us
-            self._write(depth_image(frame.depth_mm, self._unix_us + seen_us), told.sent_us)
+            self._write(image_message(frame.image, self._unix_us + seen_us), told.sent_us)
 
     def _status(self, now_us: int) -> Status:
         status, battery = self._link.status(), self._link.battery()

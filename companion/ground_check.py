@@ -99,14 +99,15 @@ def look_at_camera(
     while watch.time_us() < LOOK_S * US_PER_S and not stop.is_set():
         newer = camera.wait(last.frame.sequence, 0.5)
         if newer is not None:
-            frozen = frozen and np.array_equal(first.frame.depth_mm, newer.frame.depth_mm)
+            frozen = frozen and np.array_equal(first.frame.image, newer.frame.image)
             last = newer
             ages_us.append(age_of(newer, clock.time_us()))
     lens, rate_hz = first.frame.intrinsics, len(ages_us) / LOOK_S
     if not ages_us:
         yield Finding("camera", False, f"one frame in {LOOK_S:g} s")
         return
-    told = f"{lens.width}x{lens.height} px, {rate_hz:.1f} frames/s"
+    kind = "" if lens.kind == "depth" else f"{lens.kind}, "
+    told = f"{kind}{lens.width}x{lens.height} px, {rate_hz:.1f} frames/s"
     if frozen:
         # A simulator's image of a vehicle at rest has no noise, so this is no fault by itself.
         told += "; every image is the same (a real camera has noise)"
@@ -153,7 +154,7 @@ def time_decisions(mission: Mission, seen: ReceivedFrame, state: Kinematics) -> 
     frame, watch, took_us = seen.frame, WallClock(), []
     told = InFlight.of_first_decisions(1)
     observation = observe(
-        *(frame.depth_mm, frame.intrinsics, state, np.asarray(mission.goal, np.float64)),
+        *(frame.image, frame.intrinsics, state, np.asarray(mission.goal, np.float64)),
         InFlight(told.command[0], told.latency_s[0], told.age_s[0]),
     )
     try:

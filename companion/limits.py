@@ -11,7 +11,7 @@ estimator's task.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -319,13 +319,14 @@ class CameraLimits:
 
     def _pictured(self, frame: Frame, state: Kinematics, now_us: int) -> Ending | None:
         """Return whether the image is always the same, or shows nothing where ground must be."""
-        depth = frame.depth_mm
-        blank = bool((depth == depth.flat[0]).all())
-        silent_us = self._image.for_us(depth, now_us)
-        if silent_us > self._same_us and not blank:
+        image = frame.image
+        even = bool((image == image[0, 0]).all())
+        silent_us = self._image.for_us(image, now_us)
+        if silent_us > self._same_us and not even:
             return Ending(
                 CAMERA_FROZEN, f"the image has not changed for {silent_us / US_PER_S:.1f} s"
             )
+        blank = even and (frame.intrinsics.kind == "depth" or _dead(image))
         if not blank or not ground_in_view(frame, state, self._mount_rad):
             self._blank_since_us = None
         elif self._blank_since_us is None:
@@ -333,9 +334,23 @@ class CameraLimits:
         elif now_us - self._blank_since_us > self._silence_us:
             return Ending(
                 CAMERA_WRONG,
-                f"every pixel reads {int(depth.flat[0])} mm, and the ground must be in view",
+                f"every pixel reads {_reading(frame)}, and the ground must be in view",
             )
         return None
+
+
+def _dead(image: NDArray[Any]) -> bool:
+    """Return whether an even picture is all black, as of a covered or broken camera, or all white.
+
+    Any other even picture may be a wall without texture.
+    """
+    return bool((image[0, 0] == image.flat[0]).all()) and int(image.flat[0]) in (0, 255)
+
+
+def _reading(frame: Frame) -> str:
+    """Return what the first pixel reads, in words."""
+    numbers = ", ".join(str(int(number)) for number in np.ravel(frame.image[0, 0]))
+    return f"{numbers} mm" if frame.intrinsics.kind == "depth" else f"{numbers} of 255"
 
 
 def ground_in_view(frame: Frame, state: Kinematics, mount_pitch_up_rad: float) -> bool:

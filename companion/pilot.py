@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from threading import Event
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,7 +60,8 @@ class Decided(NamedTuple):
     """When that of the decision before ended; `NO_STAMP` for the first."""
     expires_us: int | None
     """When the velocity is zeroed unless another decision has come; None: never."""
-    depth_mm: NDArray[np.uint16]  # (h, w) what the policy saw [mm], compensated where that is asked
+    image: NDArray[Any]
+    """What the policy saw, as `Frame.image`; compensated where that is asked."""
 
 
 @dataclass
@@ -84,7 +85,7 @@ class Pilot:
     """Told every decision when it is sent; it must return at once."""
     memory: DecisionMemory = field(init=False)
     """The setpoints and latencies so far."""
-    earlier_mm: deque[NDArray[np.uint16]] = field(
+    earlier: deque[NDArray[Any]] = field(
         default_factory=lambda: deque(maxlen=MOST_FRAMES - 1), init=False
     )
     """What the decisions before saw, the newest first."""
@@ -108,7 +109,7 @@ class Pilot:
         sequence = -1
         if self.limits is not None:
             self.limits.begin(self.clock.time_us())
-        self.earlier_mm.clear()
+        self.earlier.clear()
         if self.compensator is not None:
             self.compensator.begin(0)
         else:
@@ -176,7 +177,7 @@ class Pilot:
             held_us = sent_us + (hold_us if settings.decisions == "sequential" else 0)
             times = started_us, ready_us, sent_us, held_us, self.held_us
             lasts_us = None if expires_us is None else int(expires_us)
-            self.decided(Decided(seen, state, setpoint, *times, lasts_us, observation.depth_mm))
+            self.decided(Decided(seen, state, setpoint, *times, lasts_us, observation.image))
         t2_us = np.array([ready_us - started_us])
         if self.compensator is None:
             self.memory.decided(ONE, np.array([setpoint]), t2_us)
@@ -207,25 +208,25 @@ class Pilot:
         self, seen: ReceivedFrame, state: Kinematics, goal: tuple[float, float], now_us: int
     ) -> Observation:
         """Return what the policy sees: what is, or what will be when its action is sent."""
-        frame, depth_mm = seen.frame, seen.frame.depth_mm
+        frame, image = seen.frame, seen.frame.image
         age_us = np.array([age_of(seen, now_us)])
         if self.compensator is not None:
             images, states = self.compensator.foresee(
                 ONE,
-                depth_mm[None],
+                image[None],
                 age_us,
                 np.array([now_us]),
                 Kinematics(state.position[None], state.velocity[None], state.quaternion[None]),
             )
-            depth_mm = images[0]
+            image = images[0]
             state = Kinematics(states.position[0], states.velocity[0], states.quaternion[0])
         told = self.memory.in_flight(age_us)
-        earlier_mm = tuple(self.earlier_mm)
-        self.earlier_mm.appendleft(depth_mm)
+        earlier = tuple(self.earlier)
+        self.earlier.appendleft(image)
         return observe(
-            *(depth_mm, frame.intrinsics, state, np.asarray(goal, np.float64)),
+            *(image, frame.intrinsics, state, np.asarray(goal, np.float64)),
             InFlight(told.command[0], told.latency_s[0], told.age_s[0]),
-            earlier_mm,
+            earlier,
         )
 
 

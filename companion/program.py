@@ -14,11 +14,12 @@ from pydantic import TypeAdapter
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.clock import Clock, WallClock
 from airl_mav.core.cpu_quota import held_to
+from airl_mav.core.errors import FieldError
 from airl_mav.core.provenance import describe_machine
 from airl_mav.flight.setup import Part, Setup
 from airl_mav.latency.samplers import LatencySampler, latency_generator
 from airl_mav.policy.actions import Policy
-from airl_mav.policy.registry import find_policy
+from airl_mav.policy.registry import camera_refused, find_policy
 from airl_mav.prediction.compensator import Compensator
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
@@ -87,6 +88,11 @@ def prepare(asked: StandAloneCompanion) -> Mission:
     loaded = load_asked_policy(asked, policy, pilot.hold_s, asked.seed)
     sampler = injection.sampler(latency_generator(asked.seed, asked.latency_seed))
     vehicle, compensator = load_vehicle(asked.vehicle), None
+    # What its card says is held against the camera's first frame, before take-off.
+    if policy.card is None and (reason := camera_refused(policy, vehicle.camera)):
+        raise FieldError(
+            "policy", asked.policy, problem=f"does not fit vehicle {asked.vehicle}: {reason}"
+        )
     if pilot.compensate:
         compensator = Compensator(1, vehicle, Intrinsics.of(vehicle.camera))
     limits = asked.limits

@@ -26,7 +26,7 @@ from firmware_sim.faults.injection import ClientFaults
 from firmware_sim.faults.timeline import FaultTimeline
 from firmware_sim.flight_controller import FlightController
 from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth
-from firmware_sim.plant.camera_server import DepthCamera
+from firmware_sim.plant.camera_server import SimulatedCamera
 from firmware_sim.plant.kinematics import POSITION, QUATERNION
 from firmware_sim.plant.plant import Plant
 from firmware_sim.recording import FlightRecorder, fault_arrays
@@ -111,10 +111,10 @@ class Simulation:
             self._let_fail(start_us)
         if self.autopilot.internals is not None:
             self.autopilot.internals.failures = ClientFaults(self._faults_now)
-        self._camera: DepthCamera | FailingCamera | None = None
+        self._camera: SimulatedCamera | FailingCamera | None = None
         """None on an endless floor."""
         if setup.arena is not None:
-            camera = DepthCamera(
+            camera = SimulatedCamera(
                 setup.vehicle.camera, setup.arena, start_us, asked.sensors, setup.seed
             )
             self._camera = camera

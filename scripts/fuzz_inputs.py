@@ -196,6 +196,8 @@ def read_damaged_file(number: int, kind: str | None = None) -> str:
 LENSES = (
     Intrinsics.from_fov(16, 12, math.pi / 2),
     Intrinsics.from_fov(16, 12, 2.0 * math.pi, "cylindrical"),
+    Intrinsics.from_fov(16, 12, math.pi / 2, kind="rgb"),
+    Intrinsics.from_fov(16, 12, 2.0 * math.pi, "cylindrical", "grey"),
 )
 STAMPS = (0, 1, -1, 2**63 - 1, -(2**63), US_PER_S, 10**15)
 NUMBERS = (0.0, -1.0, 1e-320, 1e308, math.nan, math.inf, -math.inf, 8.0)
@@ -203,9 +205,9 @@ SIDES = (0, 1, 2, 12, 16, 17, 255, 65_535)
 
 
 def hostile_frame(rng: np.random.Generator, lens: Intrinsics = LENSES[0]) -> bytes:
-    """Return the bytes of a depth frame: a sound one, or with something wrong in it."""
-    depth = rng.integers(0, 65_536, (lens.height, lens.width), np.uint16)
-    frame = bytearray(Frame(int(rng.integers(1 << 62)), 0, depth, lens).to_bytes())
+    """Return the bytes of a frame: a sound one, or with something wrong in it."""
+    image = rng.integers(0, np.iinfo(lens.dtype).max + 1, lens.shape, lens.dtype)
+    frame = bytearray(Frame(int(rng.integers(1 << 62)), 0, image, lens).to_bytes())
     kind = int(rng.integers(8))
     if kind == 1:
         struct.pack_into("<q", frame, 12, STAMPS[int(rng.integers(len(STAMPS)))])

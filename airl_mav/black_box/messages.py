@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import base64
 from dataclasses import dataclass
-from typing import Annotated, TypeAlias
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -240,22 +240,40 @@ INFO, WARNING = 2, 3
 """Levels of foxglove.Log."""
 
 
-def depth_image(depth_mm: NDArray[np.uint16], unix_us: int) -> RawImage:
-    """Return the message of a depth image (height, width) [mm], taken at a calendar time [µs]."""
-    height, width = depth_mm.shape
-    rows = np.ascontiguousarray(depth_mm, "<u2")
+ENCODINGS: dict[str, tuple[str, int]] = {
+    "mono16": ("<u2", 0),
+    "rgb8": ("u1", 3),
+    "mono8": ("u1", 1),
+}
+"""Of depth, colour and grey: type of the numbers, and channels; 0: no axis of them."""
+
+
+def image_message(image: NDArray[Any], unix_us: int) -> RawImage:
+    """Return the message of a camera's image, taken at a calendar time [µs].
+
+    It is depth (height, width) [mm], or colour (height, width, channels).
+    """
+    height, width, *channels = image.shape
+    encoding = "mono16" if not channels else "rgb8" if channels == [3] else "mono8"
+    rows = np.ascontiguousarray(image, ENCODINGS[encoding][0])
     data = base64.b64encode(rows.tobytes()).decode("ascii")
-    return RawImage(time_of(unix_us), "camera", width, height, "mono16", 2 * width, data)
+    return RawImage(
+        time_of(unix_us), "camera", width, height, encoding, rows.nbytes // height, data
+    )
 
 
-def depth_of(image: RawImage) -> NDArray[np.uint16]:
-    """Return the depth image (height, width) [mm] of a message.
+def image_of(image: RawImage) -> NDArray[Any]:
+    """Return the image of a message, as `image_message` takes it.
 
     Raises:
-        ValueError: Its data does not have its size.
+        ValueError: Its data does not have its size, or its encoding is not known.
     """
-    rows = np.frombuffer(base64.b64decode(image.data), "<u2")
-    return rows.reshape(image.height, image.width).astype(np.uint16)
+    if image.encoding not in ENCODINGS:
+        raise ValueError(f"encoding {image.encoding!r}; accepted: {', '.join(ENCODINGS)}")
+    number, channels = ENCODINGS[image.encoding]
+    rows = np.frombuffer(base64.b64decode(image.data), number)
+    shape = (image.height, image.width, channels) if channels else (image.height, image.width)
+    return rows.reshape(shape).astype(np.uint8 if channels else np.uint16)
 
 
 def text(message: str, name: str, unix_us: int, level: int = INFO) -> Log:

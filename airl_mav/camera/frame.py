@@ -1,28 +1,45 @@
-"""A depth frame and its wire format: one ZeroMQ message, header then Z16 pixels."""
+"""A camera's frame and its wire format: one ZeroMQ message, header then pixels."""
 
 from __future__ import annotations
 
 import math
 import struct
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.core.errors import UsageError
+from airl_mav.profiles.camera_kind import CameraKind, shape_of
 from airl_mav.profiles.projection import Projection
 
-MAGICS: dict[Projection, bytes] = {"pinhole": b"ADF1", "cylindrical": b"ADC1"}
-"""How a frame begins: air-learning depth frame, or cylinder, version 1."""
+MAGICS: dict[tuple[CameraKind, Projection], bytes] = {
+    ("depth", "pinhole"): b"ADF1",
+    ("depth", "cylindrical"): b"ADC1",
+    ("rgb", "pinhole"): b"ARF1",
+    ("rgb", "cylindrical"): b"ARC1",
+    ("grey", "pinhole"): b"AGF1",
+    ("grey", "cylindrical"): b"AGC1",
+}
+"""How a frame begins: air-learning depth, RGB or grey, frame or cylinder, version 1."""
 
-_PROJECTION_OF = {magic: projection for projection, magic in MAGICS.items()}
+_CAMERA_OF = {magic: camera for camera, magic in MAGICS.items()}
+
+_PIXELS: dict[CameraKind, tuple[str, int]] = {
+    "depth": ("<u2", 2),
+    "rgb": ("u1", 3),
+    "grey": ("u1", 1),
+}
+"""Type of the numbers on the wire, and bytes of a pixel."""
 
 # magic, sequence, capture time [µs], width, height, focal, cx, cy; little endian
 _HEADER = struct.Struct("<4sQqHHddd")
 
 MOST_PIXELS = 4096 * 4096
-MOST_BYTES = _HEADER.size + 2 * MOST_PIXELS
-"""Size of the largest frame, 34 MB: whoever receives them need not take in more."""
+MOST_BYTES = _HEADER.size + 3 * MOST_PIXELS
+"""Size of the largest frame, 50 MB: whoever receives them need not take in more."""
 
 MM_PER_M = 1000.0
 MAX_MM = 65_535
@@ -40,16 +57,23 @@ class FrameError(ValueError):
 
 @dataclass(frozen=True)
 class Frame:
-    """One depth image, RealSense Z16 convention."""
+    """One image of a camera."""
 
     sequence: int
     """Counts up by one per captured frame."""
     capture_time_us: int
     """Simulated time of the exposure [µs]."""
-    depth_mm: NDArray[np.uint16]
-    """(height, width) [mm]; 0 = no return. Along the optical axis of a pinhole, in the camera's
-    horizontal plane of a cylinder."""
+    image: NDArray[Any]
+    """Of depth uint16 (height, width), RealSense Z16 convention [mm]; 0 = no return. Along the
+    optical axis of a pinhole, in the camera's horizontal plane of a cylinder. Of colour uint8
+    (height, width, 3) sRGB, or (height, width, 1) grey."""
     intrinsics: Intrinsics
+    """Of its camera; its `kind` says what the pixels are."""
+
+    @property
+    def depth_mm(self) -> NDArray[np.uint16]:
+        """Depth (height, width) [mm]; 0 = no return. Raises UsageError for a colour camera."""
+        return depth_only(self.image, self.intrinsics)
 
     def depth_m(self) -> NDArray[np.float32]:
         """Return depth (height, width) [m]; 0 = no return."""
@@ -59,11 +83,11 @@ class Frame:
         """Return the wire form."""
         k = self.intrinsics
         header = _HEADER.pack(
-            MAGICS[k.projection],
+            MAGICS[k.kind, k.projection],
             *(self.sequence, self.capture_time_us),
             *(k.width, k.height, k.focal, k.cx, k.cy),
         )
-        return header + self.depth_mm.astype("<u2", copy=False).tobytes()
+        return header + self.image.astype(_PIXELS[k.kind][0], copy=False).tobytes()
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Frame:
@@ -76,12 +100,14 @@ class Frame:
         if len(data) < _HEADER.size:
             raise FrameError(f"{len(data)} bytes are too short for a frame header")
         magic, sequence, time_us, width, height, focal, cx, cy = _HEADER.unpack_from(data)
-        projection = _PROJECTION_OF.get(magic)
-        if projection is None:
-            known = " or ".join(repr(each) for each in _PROJECTION_OF)
+        camera = _CAMERA_OF.get(magic)
+        if camera is None:
+            known = " or ".join(repr(each) for each in _CAMERA_OF)
             raise FrameError(f"magic {magic!r}, expected {known}")
-        if len(data) != _HEADER.size + 2 * width * height:
-            raise FrameError(f"{len(data)} bytes do not hold {width}x{height} pixels")
+        kind, projection = camera
+        number, size = _PIXELS[kind]
+        if len(data) != _HEADER.size + size * width * height:
+            raise FrameError(f"{len(data)} bytes do not hold {width}x{height} pixels of {kind}")
         if not 0 < width * height <= MOST_PIXELS:
             raise FrameError(f"{width}x{height} pixels: accepted: 1..{MOST_PIXELS}")
         # Written so that NaN fails.
@@ -89,8 +115,21 @@ class Frame:
             raise FrameError(f"focal {focal}, centre {cx}, {cy}: no {projection} camera")
         if projection == "cylindrical" and width > _TURN * 2.0 * math.pi * focal:
             raise FrameError(f"focal {focal}, {width} px wide: a cylinder of more than one turn")
-        pixels = np.frombuffer(data, "<u2", offset=_HEADER.size).reshape(height, width)
-        return cls(sequence, time_us, pixels, Intrinsics(width, height, focal, cx, cy, projection))
+        pixels = np.frombuffer(data, number, offset=_HEADER.size)
+        lens = Intrinsics(width, height, focal, cx, cy, projection, kind)
+        return cls(sequence, time_us, pixels.reshape(shape_of(kind, height, width)), lens)
+
+
+def depth_only(image: NDArray[Any], intrinsics: Intrinsics) -> NDArray[np.uint16]:
+    """Return an image of a depth camera as it is. Raises UsageError for one of colours."""
+    if intrinsics.kind != "depth":
+        raise UsageError(f"{intrinsics.kind} camera: it gives no depth; accepted: depth")
+    return image
+
+
+def rgb_of(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return an image of a colour camera, (h, w, 3) or grey (h, w, 1), as RGB (h, w, 3)."""
+    return np.repeat(image, 3, axis=2) if image.shape[2] == 1 else image
 
 
 def depth_to_z16(depth_m: NDArray[np.floating]) -> NDArray[np.uint16]:

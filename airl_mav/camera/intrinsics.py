@@ -1,4 +1,4 @@
-"""The two models of the depth camera: a pinhole, and a cylinder that sees all round."""
+"""The two models of a camera, a pinhole and a cylinder that sees all round; what its pixels are."""
 
 from __future__ import annotations
 
@@ -6,6 +6,9 @@ import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from airl_mav.profiles.camera_kind import CameraKind, shape_of
 from airl_mav.profiles.projection import Projection
 
 if TYPE_CHECKING:  # A frame source needs no models of profiles.
@@ -15,6 +18,8 @@ if TYPE_CHECKING:  # A frame source needs no models of profiles.
 @dataclass(frozen=True)
 class Intrinsics:
     """Intrinsics with square pixels. Pixel centres are at whole numbers.
+
+    Its `kind` is part of them, so that whoever asks whether two cameras are the same asks for it.
 
     In the optical frame (right, down, forward) a pixel (u, v) looks along
 
@@ -35,6 +40,7 @@ class Intrinsics:
     cx: float
     cy: float
     projection: Projection = "pinhole"
+    kind: CameraKind = "depth"
 
     @classmethod
     def from_fov(
@@ -43,6 +49,7 @@ class Intrinsics:
         height: int,
         horizontal_fov: float,
         projection: Projection = "pinhole",
+        kind: CameraKind = "depth",
     ) -> Intrinsics:
         """Return the intrinsics of a camera with a horizontal field of view [rad].
 
@@ -52,7 +59,7 @@ class Intrinsics:
             focal = width / horizontal_fov
         else:
             focal = 0.5 * width / math.tan(0.5 * horizontal_fov)
-        return cls(width, height, focal, 0.5 * (width - 1), 0.5 * (height - 1), projection)
+        return cls(width, height, focal, 0.5 * (width - 1), 0.5 * (height - 1), projection, kind)
 
     @classmethod
     def of(cls, camera: Camera) -> Intrinsics:
@@ -62,7 +69,18 @@ class Intrinsics:
             camera.height_px,
             math.radians(camera.horizontal_fov_deg),
             camera.projection,
+            camera.kind,
         )
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of its images: (h, w) of depth, (h, w, channels) of colour."""
+        return shape_of(self.kind, self.height, self.width)
+
+    @property
+    def dtype(self) -> type[np.uint16] | type[np.uint8]:
+        """Type of its pixels: millimetres of depth, or sRGB numbers."""
+        return np.uint16 if self.kind == "depth" else np.uint8
 
     @property
     def cylindrical(self) -> bool:

@@ -14,10 +14,12 @@ from airl_mav.arena.geometry import Arena
 from airl_mav.camera.colour import Work, render_colour
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.textures import PERIOD, atlas, means
+from airl_mav.core.kernels import kernel
 from airl_mav.vehicle.rotation import Quat, Vec
 
-LUMA = (0.299, 0.587, 0.114)
-"""Shares of red, green and blue in grey: luma of ITU-R BT.601, as OpenCV and Pillow have it."""
+LUMA = (19595, 38470, 7471)
+"""Shares of red, green and blue in grey, times 65536: 0.299, 0.587 and 0.114, the luma of ITU-R
+BT.601, in the whole numbers that Pillow has for them."""
 
 
 class Picture(NamedTuple):
@@ -72,17 +74,20 @@ def render_picture(
     """
     k, obstacles, look = intrinsics, arena.obstacles, ColourArrays.of(arena.look)
     shape = (k.height, k.width)
+    # Tuples and arrays of the types that the batch twin hands over: one compiled kernel for both.
+    north, east, down = (float(part) for part in position)
+    q0, q1, q2, q3 = (float(part) for part in quaternion)
     picture = Picture(
         np.empty((*shape, 3), np.uint8), np.empty(shape, np.float32), np.empty(shape, np.int32)
     )
     render_colour(
         *picture,
         Work.of(k.width, k.height, k.cylindrical),
-        position,
-        quaternion,
-        k.focal,
-        k.cx,
-        k.cy,
+        (north, east, down),
+        (q0, q1, q2, q3),
+        float(k.focal),
+        float(k.cx),
+        float(k.cy),
         k.cylindrical,
         arena.bounds.as_array(),
         obstacles.shape,
@@ -101,8 +106,20 @@ def render_picture(
 
 def grey(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return sRGB images (..., 3) as grey ones (...): luma of the encoded numbers, rounded."""
-    luma: NDArray[np.uint8] = np.rint(rgb @ np.array(LUMA)).astype(np.uint8)
+    luma = np.empty(rgb.shape[:-1], np.uint8)
+    write_grey(luma.reshape(-1), np.ascontiguousarray(rgb).reshape(-1, 3))
     return luma
+
+
+@kernel
+def write_grey(out: NDArray[np.uint8], rgb: NDArray[np.uint8]) -> None:
+    """Write the luma (n,) of sRGB pixels (n, 3)."""
+    red, green, blue = np.uint32(LUMA[0]), np.uint32(LUMA[1]), np.uint32(LUMA[2])
+    half, shift = np.uint32(1 << 15), np.uint32(16)
+    for u in range(len(out)):
+        luma = np.uint32(rgb[u, 0]) * red + np.uint32(rgb[u, 1]) * green
+        luma += np.uint32(rgb[u, 2]) * blue + half
+        out[u] = np.uint8(luma >> shift)
 
 
 def antialiased(

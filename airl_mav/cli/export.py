@@ -23,11 +23,11 @@ from airl_mav.training.export_request import FLOWN, ExportRequest
 class ExportOptions(ExportRequest):
     """Export a stable-baselines3 .zip, or a torch module of your own, to ONNX with a policy card.
 
-    The model must take a Dict of `depth` (uint8), `velocity` and `goal`, as `--layout` and
-    `--image` say, and give the actions of `--actions`; a module of your own may take the three as
-    arguments. What a VecNormalize around the training environment did is not in a .zip: such models
-    do not fly right. A .zip holds pickled Python objects, and a module is code: export only those
-    of people you trust.
+    The model must take a Dict of the image (`depth`, `rgb` or `grey`, uint8), `velocity` and
+    `goal`, as `--layout`, `--image` and `--kind` say, and give the actions of `--actions`; a module
+    of your own may take the three as arguments. What a VecNormalize around the training environment
+    did is not in a .zip: such models do not fly right. A .zip holds pickled Python objects, and a
+    module is code: export only those of people you trust.
 
     Examples:
         airl export model.zip --algorithm PPO --out policies/mine

@@ -1,4 +1,4 @@
-"""The depth cameras of n vehicles: when frames are taken, and what is on them (Z16).
+"""The cameras of n vehicles: when frames are taken, and what is on them.
 
 One compiled call renders the images of all vehicles.
 """
@@ -20,6 +20,7 @@ from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.kernels import kernel
 from airl_mav.core.streams import Stream, stream
 from airl_mav.envs.arenas import ArenaBatch, move_obstacles
+from airl_mav.envs.colour_images import ColourImages, Looks
 from airl_mav.envs.faults import BEFORE_US, TwinFault, later_us, twin_faults
 from airl_mav.envs.fleet import Fleet
 from airl_mav.envs.saved_state import Stateful
@@ -63,6 +64,7 @@ class Cameras(Stateful):
         transport_us: int,
         noise: SensorNoise,
         faults: Sequence[Fault] = (),
+        looks: Looks | None = None,
     ) -> None:
         """Make n cameras.
 
@@ -72,10 +74,11 @@ class Cameras(Stateful):
             transport_us: From capture to decoded [µs].
             noise: Conditions that their images are taken in.
             faults: Those of the camera happen to all of them.
+            looks: How their arenas look, which colour cameras need.
         """
         self.intrinsics = Intrinsics.of(camera)
-        self.image = np.zeros((n, self.intrinsics.height, self.intrinsics.width), np.uint16)
-        """(n, h, w) newest frames, Z16 [mm]."""
+        self.image = np.zeros((n, *self.intrinsics.shape), self.intrinsics.dtype)
+        """(n, ...) newest frames, as `camera.frame.Frame.image` of each."""
         self.period_us = camera.period_us
         self.transport_us = transport_us
         self._noise = noise_of(camera, noise)
@@ -83,6 +86,11 @@ class Cameras(Stateful):
             (camera.forward_m, 0.0, -camera.up_m), float(np.deg2rad(camera.pitch_up_deg))
         )
         self._lens = lens_of(self.intrinsics, camera.range_m)
+        self._colour: ColourImages | None = None
+        """None: the cameras see depth."""
+        if self.intrinsics.kind != "depth":
+            assert looks is not None  # noqa: S101 - whoever makes colour cameras has arenas for them
+            self._colour = ColourImages(self.intrinsics, self._mount, looks)
         self._first_us = np.zeros(n, np.int64)
         failing = twin_faults(faults, "camera")
         self._late = [each for each in failing if each.fault.kind == "delay"]
@@ -169,7 +177,7 @@ class Cameras(Stateful):
         for number, at_us in self._freeze_us.items():
             who = np.abs(fleet.time_us - at_us) <= TICK_US // 2
             if who.any():
-                render_images(fleet, arenas, who, self._mount, self._lens, self._frozen[number])
+                self._render(fleet, arenas, who, self._frozen[number])
                 self._make_noisy(self._frozen[number], self._noise, who, seeds, fleet.time_us)
 
     def next_decoded_us(self, time_us: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -189,7 +197,7 @@ class Cameras(Stateful):
 
         The noise is drawn from the episodes' `seeds` (n,).
         """
-        render_images(fleet, arenas, who, self._mount, self._lens, self.image)
+        self._render(fleet, arenas, who, self.image)
         self._make_noisy(self.image, self._noise, who, seeds, fleet.time_us)
         for each in self._changed:
             acts = who & each.at(fleet.time_us)
@@ -201,9 +209,18 @@ class Cameras(Stateful):
                 own = NOISE_SEED * (each.number + 1) + seeds
                 self._make_noisy(self.image, noise, acts, own, fleet.time_us)
 
+    def _render(
+        self, fleet: Fleet, arenas: ArenaBatch, who: NDArray[np.bool_], out: NDArray[Any]
+    ) -> None:
+        """Write the images of the vehicles in `who` (n,), without noise."""
+        if self._colour is None:
+            render_images(fleet, arenas, who, self._mount, self._lens, out)
+        else:
+            self._colour.render(fleet, arenas, who, out)
+
     def _make_noisy(
         self,
-        image: NDArray[np.uint16],
+        image: NDArray[Any],
         noise: DepthNoise | None,
         who: NDArray[np.bool_],
         seeds: NDArray[np.int64],

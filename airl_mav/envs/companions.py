@@ -47,12 +47,12 @@ class Companions:
         self._memory: DecisionMemory | None = None
         if compensator is not None:
             self._memory = compensator.memory
-            self._image_mm = np.zeros((n, image.height, image.width), np.uint16)
+            self._image = np.zeros((n, *image.shape), image.dtype)
             self._state = Kinematics(np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 4)))
         elif told:
             self._memory = DecisionMemory(n)
-        self._earlier_mm = np.zeros((earlier, n, image.height, image.width), np.uint16)
-        """What the decisions before saw, the newest first; 0 = no return, or none yet."""
+        self._earlier = np.zeros((earlier, n, *image.shape), image.dtype)
+        """What the decisions before saw, the newest first; 0 = no return, black, or none yet."""
         self._age_us = np.zeros(n, np.int64)
         """Of the frames, when their decisions begin."""
 
@@ -63,13 +63,13 @@ class Companions:
         elif self._memory is not None:
             self._memory.begin(i)
         self._age_us[i] = 0
-        self._earlier_mm[:, i] = 0
+        self._earlier[:, i] = 0
 
-    def deciding(self, image_mm: NDArray[np.uint16]) -> None:
-        """Keep what all decide on, of the newest images (n, h, w), as far as it is seen again."""
-        if len(self._earlier_mm):
-            self._earlier_mm[1:] = self._earlier_mm[:-1]
-            self._earlier_mm[0] = image_mm if self._compensator is None else self._image_mm
+    def deciding(self, image: NDArray[Any]) -> None:
+        """Keep what all decide on, of the newest images (n, ...), as far as it is seen again."""
+        if len(self._earlier):
+            self._earlier[1:] = self._earlier[:-1]
+            self._earlier[0] = image if self._compensator is None else self._image
 
     def aged(self, age_us: Times) -> None:
         """Take how old the frames (n,) are of which the next decisions are made."""
@@ -100,7 +100,7 @@ class Companions:
     def look_ahead(
         self,
         who: NDArray[np.bool_],
-        image_mm: NDArray[np.uint16],
+        image: NDArray[Any],
         now_us: Times,
         state: Kinematics,
     ) -> None:
@@ -108,38 +108,38 @@ class Companions:
 
         Args:
             who: (n,) the companions that decide next.
-            image_mm: (n, h, w) newest images, 0 = no return.
+            image: (n, h, w) newest depth images [mm], 0 = no return.
             now_us: When their decisions begin.
             state: Telemetry of all n.
         """
         if self._compensator is None:
             return
-        image, then = self._compensator.foresee(
-            np.flatnonzero(who), image_mm, self._age_us, now_us, state
+        foreseen, then = self._compensator.foresee(
+            np.flatnonzero(who), image, self._age_us, now_us, state
         )
-        self._image_mm[who] = image[who]
+        self._image[who] = foreseen[who]
         for kept, found in zip(vars(self._state).values(), vars(then).values(), strict=True):
             kept[who] = found[who]
 
-    def foreseen(self, rows: Rows) -> tuple[NDArray[np.uint16], Kinematics]:
+    def foreseen(self, rows: Rows) -> tuple[NDArray[Any], Kinematics]:
         """Return what the decisions of those that `foresee` will act on: images and states."""
-        return self._image_mm[rows], self._state.rows(rows)
+        return self._image[rows], self._state.rows(rows)
 
     def told(self, rows: Rows) -> InFlight | None:
         """Return what policies may be told of the decisions; None: nobody keeps account."""
         return None if self._memory is None else self._memory.in_flight(self._age_us).rows(rows)
 
-    def earlier_mm(self, rows: Rows) -> tuple[NDArray[np.uint16], ...]:
-        """Return the images (k, h, w) of the decisions before, the newest first."""
-        return tuple(image[rows] for image in self._earlier_mm)
+    def earlier(self, rows: Rows) -> tuple[NDArray[Any], ...]:
+        """Return the images (k, ...) of the decisions before, the newest first."""
+        return tuple(image[rows] for image in self._earlier)
 
     def held(self) -> Mapping[str, Any]:
         """Return by name all arrays that change, for checkpoints."""
         held: dict[str, Any] = {}
-        if len(self._earlier_mm):
-            held["earlier"] = {"depth_mm": self._earlier_mm}
+        if len(self._earlier):
+            held["earlier"] = {"depth_mm": self._earlier}
         if self._compensator is not None:
-            foreseen = {"depth_mm": self._image_mm, **vars(self._state)}
+            foreseen = {"depth_mm": self._image, **vars(self._state)}
             held["compensator"] = {**self._compensator.held(), "foreseen": foreseen}
         if self._memory is not None:
             held["decisions"] = {**self._memory.held(), "age_us": self._age_us}

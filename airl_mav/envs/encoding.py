@@ -1,6 +1,6 @@
 """The network's images of n vehicles by a compiled loop: those of numpy, several times faster.
 
-`policy.layouts` says what they are; the companion, which has no numba, makes them with numpy.
+`policy.images` says what they are; the companion, which has no numba, makes them with numpy.
 """
 
 from __future__ import annotations
@@ -9,16 +9,56 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.core.kernels import kernel
-from airl_mav.policy.layouts import Bytes
+from airl_mav.policy.images import Bytes, Shrink
 
 
-def shrink(
+def shrink_depth(
     depth_mm: NDArray[np.uint16], rows: int, columns: int, bytes_of: Bytes
 ) -> NDArray[np.uint8]:
-    """Return what `policy.layouts.shrink` returns."""
+    """Return what `policy.images.shrink_depth` returns."""
     images = np.empty((len(depth_mm), rows, columns), np.uint8)
     _shrink(depth_mm, bytes_of.table, bytes_of.far_mm, images)
     return images
+
+
+def shrink_colour(image: NDArray[np.uint8], rows: int, columns: int) -> NDArray[np.uint8]:
+    """Return what `policy.images.shrink_colour` returns."""
+    images = np.empty((len(image), image.shape[3], rows, columns), np.uint8)
+    _shrink_colour(image, images)
+    return images
+
+
+COMPILED = Shrink(shrink_depth, shrink_colour)
+"""As the batch twin does it."""
+
+
+@kernel
+def _shrink_colour(image: NDArray[np.uint8], out: NDArray[np.uint8]) -> None:
+    channels, rows, columns = out.shape[1], out.shape[2], out.shape[3]
+    tall, wide = image.shape[1] // rows, image.shape[2] // columns
+    if tall == 1 and wide == 1:
+        for i in range(len(out)):
+            for row in range(rows):
+                for channel in range(channels):
+                    line = out[i, channel, row]
+                    for column in range(columns):
+                        line[column] = image[i, row, column, channel]
+        return
+    count = np.uint32(tall * wide)
+    sums = np.empty((channels, columns), np.uint32)
+    for i in range(len(out)):
+        for row in range(rows):
+            sums[:, :] = count // np.uint32(2)
+            for k in range(tall):
+                for column in range(columns):
+                    for m in range(wide):
+                        for channel in range(channels):
+                            sums[channel, column] += image[
+                                i, row * tall + k, column * wide + m, channel
+                            ]
+            for channel in range(channels):
+                for column in range(columns):
+                    out[i, channel, row, column] = np.uint8(sums[channel, column] // count)
 
 
 @kernel

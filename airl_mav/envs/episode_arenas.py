@@ -12,6 +12,7 @@ from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena
 from airl_mav.core.errors import UsageError
 from airl_mav.envs.arenas import batch_of, put_arena, with_room
+from airl_mav.envs.colour_images import Looks
 from airl_mav.envs.curriculum import check_stage, stages_of
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.profiles.arena import ArenaSpec
@@ -27,6 +28,8 @@ class EpisodeArenas:
         n: int,
         vehicle_width_m: float,
         arena_seed: int | None,
+        *,
+        looks: bool = False,
     ) -> None:
         """Make none yet.
 
@@ -36,6 +39,7 @@ class EpisodeArenas:
             n: Number of slots.
             vehicle_width_m: A vehicle of this width has a way to each goal [m].
             arena_seed: Seed of arena and goal of all episodes; None: each episode's own.
+            looks: Whether it matters how they look: a camera sees colours.
         """
         self.spec = arena
         self.stages = stages_of(spec.curriculum, arena)
@@ -51,6 +55,8 @@ class EpisodeArenas:
         """(n,) whether an episode has begun."""
         self.batch = batch_of([])
         """What the kernels look at; replaced where an arena is larger than all before."""
+        self.looks = Looks(n) if looks else None
+        """How they look; None: nobody asks."""
         self._ahead: dict[tuple[int, int | None], Arena] = {}
         """Arenas that were made ahead, by seed and zone."""
 
@@ -63,6 +69,8 @@ class EpisodeArenas:
         arena = self._ahead.pop((seed, zone), None) or self._made(seed, zone)
         self.present[i], self.begun[i] = arena, True
         self.seeds[i], self.zones[i] = seed, -1 if zone is None else zone
+        if self.looks is not None:
+            self.looks.put(i, arena)
         if len(self.batch.bounds) == 0:
             # The others stay in the first one's until their own begin.
             self.batch = batch_of([arena] * len(self.present))
@@ -98,6 +106,8 @@ class EpisodeArenas:
         spare = next((arena for arena in self.present if arena is not None), None)
         room = [spare if arena is None else arena for arena in self.present]
         self.batch = batch_of([arena for arena in room if arena is not None])
+        if self.looks is not None:
+            self.looks.restore(self.present)
 
     def _made(self, seed: int, zone: int | None) -> Arena:
         stage = None if zone is None else self.stages[zone]

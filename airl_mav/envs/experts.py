@@ -73,7 +73,13 @@ class GreedyPilots:
     """The baseline, one a flight; the nearest command to its own is chosen. A `Chooser`."""
 
     def __init__(self, navigation: Navigation, known: NDArray[np.float64]) -> None:
-        """Take the flights, and the commands (c, 3) to choose from."""
+        """Take the flights, and the commands (c, 3) to choose from.
+
+        Raises FieldError where they see no depth.
+        """
+        if navigation.camera.kind != "depth":
+            accepted = f"planner with a camera of kind {navigation.camera.kind!r}"
+            raise FieldError("expert", "greedy", accepted)
         self._navigation = navigation
         self._commands = known
         self._settings = GreedySettings(period_s=navigation.spec.episode.hold_s)

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.noise import check_noise
 from airl_mav.core.constants import TICK_US, US_PER_MS, US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.core.streams import Stream, stream
@@ -24,7 +25,7 @@ from airl_mav.envs.cameras import Cameras
 from airl_mav.envs.companions import Companions
 from airl_mav.envs.delay import injections_of
 from airl_mav.envs.draws import DelayDraws
-from airl_mav.envs.encoding import shrink
+from airl_mav.envs.encoding import COMPILED
 from airl_mav.envs.episode_arenas import EpisodeArenas
 from airl_mav.envs.estimation import Telemetry
 from airl_mav.envs.faults import later_us, twin_faults
@@ -150,6 +151,7 @@ class Navigation(Stateful):
             projection=self.camera.projection,
             horizontal_fov_deg=self.camera.horizontal_fov_deg,
             range_m=self.camera.range_m,
+            kind=self.camera.kind,
             frames=spec.frames,
             in_flight=spec.in_flight,
         )
@@ -169,7 +171,12 @@ class Navigation(Stateful):
         hover_s = rules.hover_after_s
         self._hover_us = None if hover_s is None else round(hover_s * US_PER_S)
         self._places = EpisodeArenas(
-            spec, self.arena_spec, n, self.vehicle.body.width_m, arena_seed
+            spec,
+            self.arena_spec,
+            n,
+            self.vehicle.body.width_m,
+            arena_seed,
+            looks=self.camera.kind != "depth",
         )
         self.stages, self.arenas = self._places.stages, self._places.present
         self.seeds, self.zones = self._places.seeds, self._places.zones
@@ -182,11 +189,14 @@ class Navigation(Stateful):
         )
         randomisation = spec.randomisation
         check_spread(self.vehicle, randomisation, "randomisation")
+        check_noise(self.camera, randomisation, faults, "randomisation")
         table = self.vehicle.estimation if randomisation.estimation else None
         self._telemetry = Telemetry(n, table, randomisation.navigation_noise)
         check_twin(faults, pipelined=spec.decisions == "pipelined")
         self._winds = Winds(n, spec.wind, faults)
-        self.cameras = Cameras(n, self.camera, self._transport_us, randomisation, faults)
+        self.cameras = Cameras(
+            n, self.camera, self._transport_us, randomisation, faults, self._places.looks
+        )
         self._uplink = twin_faults(faults, "uplink")
         self._timing: SequentialTiming | PipelinedTiming
         if spec.decisions == "pipelined":
@@ -270,16 +280,14 @@ class Navigation(Stateful):
         else:
             image, state = self.cameras.image[rows], self.kinematics(rows)
         goal = self._places.batch.goal[rows]
-        return observe(
-            image, self.intrinsics, state, goal, known.told(rows), known.earlier_mm(rows)
-        )
+        return observe(image, self.intrinsics, state, goal, known.told(rows), known.earlier(rows))
 
     def observe(self, slots: Sequence[int] | None = None) -> Encoded:
         """Return the present observations in the environment's layout.
 
         Of all vehicles, or of those in `slots`.
         """
-        return encode_layout(self.observation, self.see(slots), shrink)
+        return encode_layout(self.observation, self.see(slots), COMPILED)
 
     def kinematics(self, rows: Rows = EVERYONE) -> Kinematics:
         """Return the state of all n as telemetry reports it: with the estimator's error."""

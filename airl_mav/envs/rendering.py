@@ -1,4 +1,4 @@
-"""Images of an episode: the arena from above, the depth image, and the figures.
+"""Images of an episode: the arena from above, what the network sees, and the figures.
 
 What stays the same over an episode is drawn once; a frame adds the moving parts.
 """
@@ -60,7 +60,11 @@ class EpisodeRenderer:
         self._eye.set_anchor("N")
         self._eye.set(xticks=[], yticks=[])
         self._eye.spines[:].set_color(GRID_COLOUR)
-        self._eye.set_title("depth that the network sees", fontsize=11, color=TEXT_COLOUR)
+        self._eye.set_title(
+            f"{self._navigation.observation.kind} that the network sees",
+            fontsize=11,
+            color=TEXT_COLOUR,
+        )
         movers = range(arena.n_static, len(arena.obstacles))
         self._outlines = [_outline(arena.obstacles, i) for i in movers]
         face, edge = MOVING_COLOURS
@@ -92,13 +96,13 @@ class EpisodeRenderer:
         self._background = None
 
     def draw(
-        self, trail: Sequence[NDArray[np.float64]], depth: NDArray[np.uint8]
+        self, trail: Sequence[NDArray[np.float64]], image: NDArray[np.uint8]
     ) -> NDArray[np.uint8]:
         """Return the image of the present moment.
 
         Args:
             trail: Path so far: north, east [m].
-            depth: (h, w) as the network sees it.
+            image: (h, w), or (h, w, 3) in colour, as the network sees it.
 
         Raises:
             ResetNeeded: No episode has begun.
@@ -112,14 +116,14 @@ class EpisodeRenderer:
             self._canvas.draw()
             self._background = self._canvas.copy_from_bbox(self._figure.bbox)
         self._canvas.restore_region(self._background)
-        self._update(arena, np.array(trail), depth)
+        self._update(arena, np.array(trail), image)
         for artist in (self._moving, self._trail, self._vehicle):
             self._map.draw_artist(artist)
         self._eye.draw_artist(self._image)
         self._figure.draw_artist(self._text)
         return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
 
-    def _update(self, arena: Arena, trail: NDArray[np.float64], depth: NDArray[np.uint8]) -> None:
+    def _update(self, arena: Arena, trail: NDArray[np.float64], image: NDArray[np.uint8]) -> None:
         now, truth = self._navigation.flights(), self._navigation.truth()
         position = truth.position[0]
         centers = arena.centers_at(round(now.time_s[0] * US_PER_S))[arena.n_static :, 1::-1]
@@ -128,7 +132,7 @@ class EpisodeRenderer:
         )
         self._trail.set_data(trail[:, 1], trail[:, 0])
         self._vehicle.set_xy(_arrow(float(quat_yaw(truth.quaternion[0]))) + position[1::-1])
-        self._image.set_data(depth)
+        self._image.set_data(image)
         self._text.set_text(
             f"time   {now.time_s[0]:7.2f} s     {Verdict(int(now.verdict[0])).name.lower()}\n"
             f"goal   {now.goal_distance_m[0]:7.2f} m\n"

@@ -21,13 +21,14 @@ from airl_mav.envs.fleet import Verdict
 from airl_mav.envs.navigation import Flights
 from airl_mav.envs.rendering import EpisodeRenderer, Window, display_found
 from airl_mav.envs.spec import EnvironmentSpec
-from airl_mav.policy.layouts import DEPTH, Encoded
+from airl_mav.policy.layouts import Encoded, newest_frame
 
 
 class NavigationEnv(Decisions, gym.Env[Encoded, Any]):
     """One vehicle that flies to its goal; a step is a decision and its hold.
 
-    Observation: a Dict of `depth`, `velocity` and `goal` (`airl_mav.policy.layouts`). `info`
+    Observation: a Dict of `velocity`, `goal` and the image, whose key is what the camera gives:
+    `depth`, `rgb` or `grey` (`airl_mav.policy.layouts`). `info`
     carries `seed`, `zone` (-1: the whole arena), `flight_time_s`, `distance_m`, `energy_j` and
     `goal_distance_m`; at the end also `success` and `outcome` (success, collision, battery,
     timeout). Only a timeout is a truncation.
@@ -62,7 +63,7 @@ class NavigationEnv(Decisions, gym.Env[Encoded, Any]):
         if not display_found():
             # Gymnasium's checker opens every mode that is offered.
             self.metadata["render_modes"] = [mode for mode in modes if mode != "human"]
-        self._depth = np.zeros((0, 0), np.uint8)
+        self._image = np.zeros((0, 0), np.uint8)
         self._trail: list[NDArray[np.float64]] = []
         self._renderer: EpisodeRenderer | None = None
         self._window = Window(fps) if render_mode == "human" else None
@@ -114,7 +115,7 @@ class NavigationEnv(Decisions, gym.Env[Encoded, Any]):
     def _observe(self) -> Encoded:
         seen = {key: value[0] for key, value in self.navigation.observe().items()}
         if self.render_mode is not None:
-            self._depth = seen[DEPTH][0].copy()
+            self._image = newest_frame(self.navigation.observation, seen)
             self._trail.append(self.navigation.truth().position[0, :2])
         if self._window is not None:
             self._window.show(self._frame())
@@ -126,4 +127,4 @@ class NavigationEnv(Decisions, gym.Env[Encoded, Any]):
     def _frame(self) -> NDArray[np.uint8]:
         if self._renderer is None:
             self._renderer = EpisodeRenderer(self.navigation)
-        return self._renderer.draw(self._trail, self._depth)
+        return self._renderer.draw(self._trail, self._image)

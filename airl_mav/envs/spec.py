@@ -14,9 +14,10 @@ from airl_mav.flight.judge import GOAL_RADIUS_M, TIME_LIMIT_S, GoalRadius, TimeL
 from airl_mav.policy.action_sets import PAPER_SPEED_M_S, ActionSetName, ActionSpec
 from airl_mav.policy.actions import DecisionTiming
 from airl_mav.policy.layouts import STRIP_ROWS, Frames, LayoutName, Told
+from airl_mav.profiles.camera_kind import CameraKind
 from airl_mav.profiles.conditions import SensorNoise, Spread, WindSettings
 from airl_mav.profiles.projection import CYLINDER_MOST_DEG, Projection, check_fov
-from airl_mav.profiles.vehicle import Camera, load_vehicle
+from airl_mav.profiles.vehicle import Camera, check_matched, load_vehicle
 
 SHIPPED_REWARDS = ("shaped", "timed", "paper-scaled", "paper")
 """See `envs.rewards`."""
@@ -67,11 +68,15 @@ class CameraChange(ProfileModel):
         default=None,
     )
     range_m: float | None = quantity("farthest depth returned", "m", gt=0.5, le=65, default=None)
+    kind: CameraKind | None = Field(
+        default=None, description="what its pixels are: depth, rgb or grey"
+    )
 
     def of(self, camera: Camera) -> Camera:
         """Return a vehicle's camera with the changes. Raises FieldError where they do not fit."""
         made = camera.model_copy(update=self.model_dump(exclude_none=True))
         check_fov("camera.horizontal_fov_deg", made.projection, made.horizontal_fov_deg)
+        check_matched("camera.kind", made)
         return made
 
 

@@ -194,6 +194,8 @@ def _ways_of_compensation(
         return (), ()
     if load_vehicle(scenario.vehicle).response is None:
         return (), (f"The response of vehicle {scenario.vehicle} is not known: not compensated.",)
+    if not load_vehicle(scenario.vehicle).compensable:
+        return (), (f"Vehicle {scenario.vehicle} has a camera without depth: not compensated.",)
     on_card = None if policy.card is None else policy.card.hover_after_s
     if (scenario.watchdog.hover_after_s, on_card) != (None, None):
         told = f"{policy.name} hovers after its hold: its decisions are not pipelined."

@@ -197,6 +197,9 @@ def _noticed(
         raise FieldError(
             "sensing_distance_m", problem=f"needed: policy {policy.name} is no network"
         )
+    if policy.card.observation.kind != "depth":
+        kind = policy.card.observation.kind
+        raise FieldError("sensing_distance_m", problem=f"needed: policy {policy.name} sees {kind}")
     if (reason := vehicle_mismatch(policy.card, vehicle.camera)) is not None:
         raise FieldError("policy", request.policy, problem=f"does not fit the vehicle: {reason}")
     depths = noticed_m(load_learned(policy.folder, policy.card), vehicle)

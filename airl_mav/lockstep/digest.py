@@ -69,5 +69,5 @@ class WitnessedPolicy:
         """Return the policy's action."""
         seen = observation
         numbers = np.array([*seen.goal, *seen.velocity, seen.roll, seen.pitch, seen.yaw])
-        self._digest.add("observations", 0, seen.depth_mm.tobytes() + numbers.tobytes())
+        self._digest.add("observations", 0, seen.image.tobytes() + numbers.tobytes())
         return self._policy.act(observation)

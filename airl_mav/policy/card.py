@@ -300,8 +300,8 @@ def vehicle_mismatch(card: PolicyCard, camera: Camera) -> str | None:
     """Return why a vehicle's camera cannot serve a policy, or None when it can."""
     if (reason := camera_mismatch(card.observation, Intrinsics.of(camera))) is not None:
         return reason
-    # What lies between the two would look free, and was not so in training.
-    if camera.range_m < card.observation.range_m:
+    # What lies between the two would look free, and was not so in training. Colour has no range.
+    if camera.kind == "depth" and camera.range_m < card.observation.range_m:
         return (
             f"camera with a range of {camera.range_m:g} m; "
             f"accepted: {card.observation.range_m:g} m or more"

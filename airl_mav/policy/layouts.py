@@ -1,9 +1,10 @@
 """Observation layouts: from what the vehicle senses to the arrays that a network takes.
 
-`body` is the default: a depth image, and goal and velocity in the heading frame. `paper` is Air
-Learning's own input as its code has it: a 154 x 256 image whose top rows draw the bearing of the
-goal, and vectors in the world frame. Both are Dicts of `depth`, `velocity` and `goal`. Any other is
-the user's own: a class, made without arguments, whose objects are a `Layout`.
+`body` is the default: the camera's image, and goal and velocity in the heading frame. `paper` is
+Air Learning's own input as its code has it: a 154 x 256 image whose top rows draw the bearing of
+the goal, and vectors in the world frame. Both are Dicts of the image, `velocity` and `goal`; the
+image's key is what the camera gives: `depth`, `rgb` or `grey`. Any other is the user's own: a
+class, made without arguments, whose objects are a `Layout`.
 
 The function that trains is the function that flies: `encode_layout` takes n vehicles at a time,
 and the companion is n = 1.
@@ -12,7 +13,7 @@ and the companion is n = 1.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Iterable, Mapping
 from functools import cache
 from typing import Annotated, Any, Literal, NamedTuple, Protocol, cast
 
@@ -20,21 +21,28 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from airl_mav.camera.frame import MAX_MM, MM_PER_M
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core import plugins
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.frames import heading_to_ned
+from airl_mav.policy.images import NUMPY, Shrink, body_bytes, paper_bytes
 from airl_mav.policy.observation import InFlight, Observation
+from airl_mav.profiles.camera_kind import CHANNELS, KINDS, CameraKind
 from airl_mav.profiles.projection import CYLINDER_MOST_DEG, Projection, check_fov
 
 SHIPPED = ("body", "paper")
 LayoutName = Annotated[str, plugins.part_name(plugins.LAYOUTS, SHIPPED)]
 Encoded = dict[str, NDArray[Any]]
 
-DEPTH, VELOCITY, GOAL = "depth", "velocity", "goal"
-"""Keys of the shipped layouts; every one has the first."""
+VELOCITY, GOAL = "velocity", "goal"
+"""Keys of the shipped layouts, beside that of the image, which is the camera's kind."""
+
+
+def image_key(keys: Iterable[str]) -> str:
+    """Return the key of the image among those of a layout. Raises StopIteration where none is."""
+    return next(key for key in keys if key in KINDS)
+
 
 IN_FLIGHT = "in_flight"
 """Key of what else a network is told, where it is."""
@@ -87,7 +95,16 @@ class ObservationSpec(ProfileModel):
         gt=10,
         le=CYLINDER_MOST_DEG,
     )
-    range_m: float = quantity("depth from which on everything looks far", "m", gt=0.5, le=65)
+    range_m: float = quantity(
+        "depth from which on everything looks far; rgb and grey images have no such depth",
+        "m",
+        gt=0.5,
+        le=65,
+    )
+    kind: CameraKind = Field(
+        default="depth",
+        description="what the camera gives, and the key of the image: depth, rgb or grey",
+    )
     frames: Frames = 1
     in_flight: tuple[Told, ...] = Field(
         default=(),
@@ -104,6 +121,8 @@ class ObservationSpec(ProfileModel):
             )
         if self.frames > 1 and self.layout == "paper":
             raise ValueError(f"frames = {self.frames}: accepted: 1 with layout 'paper'")
+        if self.kind != "depth" and self.layout == "paper":
+            raise ValueError(f"kind = {self.kind!r}: accepted: 'depth' with layout 'paper'")
         check_fov("horizontal_fov_deg", self.projection, self.horizontal_fov_deg)
         return self
 
@@ -111,6 +130,11 @@ class ObservationSpec(ProfileModel):
     def camera_rows(self) -> int:
         """Rows of the image that come from the camera."""
         return self.height_px - (STRIP_ROWS if self.layout == "paper" else 0)
+
+    @property
+    def channels(self) -> int:
+        """Channels of the image that the network sees: those of a frame, for each frame."""
+        return CHANNELS[self.kind] * self.frames
 
 
 class Box(NamedTuple):
@@ -126,7 +150,7 @@ class Layout(Protocol):
     """A layout of the user's."""
 
     def boxes(self, spec: ObservationSpec) -> Mapping[str, Box]:
-        """Return its arrays by key: `depth` uint8 (channels, height, width), others float32."""
+        """Return its arrays by key: `spec.kind` uint8 (channels, height, width), others float32."""
         ...
 
     def encode(self, spec: ObservationSpec, seen: Observation) -> Mapping[str, NDArray[Any]]:
@@ -143,7 +167,7 @@ def boxes(spec: ObservationSpec) -> dict[str, Box]:
     if spec.layout not in SHIPPED:
         return _own_boxes(spec)
     found = {
-        DEPTH: Box((spec.frames, spec.height_px, spec.width_px), np.uint8, 0, 255),
+        spec.kind: Box((spec.channels, spec.height_px, spec.width_px), np.uint8, 0, 255),
         VELOCITY: Box((3,), np.float32, -math.inf, math.inf),
         GOAL: Box((3,), np.float32, -math.inf, math.inf),
     }
@@ -156,8 +180,11 @@ def boxes(spec: ObservationSpec) -> dict[str, Box]:
 def camera_mismatch(spec: ObservationSpec, camera: Intrinsics) -> str | None:
     """Return why a camera cannot serve a layout, or None when it can.
 
-    Its image must be a whole multiple of the network's, its projection and field of view the same.
+    It gives what the network takes, its image is a whole multiple of the network's, projection and
+    field of view are the same.
     """
+    if camera.kind != spec.kind:
+        return f"{camera.kind} camera; accepted: {spec.kind}"
     rows, columns = spec.camera_rows, spec.width_px
     if (
         camera.width % columns
@@ -179,29 +206,7 @@ def camera_mismatch(spec: ObservationSpec, camera: Intrinsics) -> str | None:
     return None
 
 
-class Bytes(NamedTuple):
-    """How depths become the network's bytes."""
-
-    table: NDArray[np.uint8]
-    """(65536,) a byte for each value of `nearest_returns`."""
-    far_mm: float = 0.0
-    """Not 0: each of them is 255 (value + 1) / far_mm in single precision, rounded to the nearest
-    and 255 at most, which a compiler turns into vector instructions as it cannot a table."""
-
-
-Shrink = Callable[[NDArray[np.uint16], int, int, Bytes], NDArray[np.uint8]]
-"""From Z16 images (n, h, w), rows, columns and the bytes of depths to the images (n, rows, columns)
-of those bytes."""
-
-
-def shrink(
-    depth_mm: NDArray[np.uint16], rows: int, columns: int, bytes_of: Bytes
-) -> NDArray[np.uint8]:
-    """Return what numpy makes of images; a `Shrink`."""
-    return bytes_of.table[nearest_returns(depth_mm, rows, columns)]
-
-
-def encode_layout(spec: ObservationSpec, seen: Observation, shrink: Shrink = shrink) -> Encoded:
+def encode_layout(spec: ObservationSpec, seen: Observation, shrink: Shrink = NUMPY) -> Encoded:
     """Return the arrays of a layout for n vehicles.
 
     Args:
@@ -210,8 +215,9 @@ def encode_layout(spec: ObservationSpec, seen: Observation, shrink: Shrink = shr
         shrink: What makes the network's images of the camera's; numpy by default.
 
     Returns:
-        `depth` (n, frames, height, width) uint8, the newest first and "no return" where there was
-        none yet, `velocity` (n, 3) and `goal` (n, 3) float32.
+        The image uint8, the newest frame first: `depth` (n, frames, height, width), "no return"
+        where there was none yet; `rgb` (n, 3 frames, height, width) and `grey` (n, frames, height,
+        width), black where there was none yet. `velocity` (n, 3) and `goal` (n, 3) float32.
         `body`: velocity forward, right, down / 5 m/s; goal as cosine and sine of its bearing and
         its distance / 20 m. `paper`: velocity NED [m/s]; goal as north, east [m] and distance [m].
         Where the network is told more, `in_flight` (n, k) float32: forward, right / 5 m/s and yaw
@@ -224,8 +230,7 @@ def encode_layout(spec: ObservationSpec, seen: Observation, shrink: Shrink = shr
     if spec.layout not in SHIPPED:
         return _own_arrays(spec, seen)
     distance = np.hypot(seen.goal[:, 0], seen.goal[:, 1])
-    bytes_of = (_body_bytes if spec.layout == "body" else _paper_bytes)(spec.range_m)
-    image = shrink(seen.depth_mm, spec.camera_rows, spec.width_px, bytes_of)
+    image = _images(spec, seen, shrink)
     if spec.layout == "body":
         safe = np.maximum(distance, 1e-6)
         goal = np.stack(
@@ -233,15 +238,13 @@ def encode_layout(spec: ObservationSpec, seen: Observation, shrink: Shrink = shr
         )
         velocity = seen.velocity / SPEED_SCALE_M_S
     else:
-        image = np.concatenate([_bearing_strip(spec, seen), image], axis=1)
+        image = np.concatenate([_bearing_strip(spec, seen)[:, None], image], axis=2)
         level = np.concatenate([seen.goal, np.zeros((len(distance), 1))], axis=1)
         goal = heading_to_ned(level, seen.yaw)
         goal[:, 2] = distance
         velocity = heading_to_ned(seen.velocity, seen.yaw)
     encoded: Encoded = {
-        DEPTH: image[:, None]
-        if spec.frames == 1
-        else _stacked(spec, image, seen, shrink, bytes_of),
+        spec.kind: image,
         VELOCITY: velocity.astype(np.float32),
         GOAL: goal.astype(np.float32),
     }
@@ -250,18 +253,26 @@ def encode_layout(spec: ObservationSpec, seen: Observation, shrink: Shrink = shr
     return encoded
 
 
-def _stacked(
-    spec: ObservationSpec,
-    newest: NDArray[np.uint8],
-    seen: Observation,
-    shrink: Shrink,
-    bytes_of: Bytes,
-) -> NDArray[np.uint8]:
-    """Return the network's images (n, frames, height, width), the newest first."""
-    stack = np.full((len(newest), spec.frames, *newest.shape[1:]), 255, np.uint8)
-    stack[:, 0] = newest
-    for k, image in enumerate(seen.earlier_mm[: spec.frames - 1], start=1):
-        stack[:, k] = shrink(image, spec.camera_rows, spec.width_px, bytes_of)
+def _images(spec: ObservationSpec, seen: Observation, shrink: Shrink) -> NDArray[np.uint8]:
+    """Return the network's images (n, channels, rows of the camera, width), the newest first."""
+    rows, columns = spec.camera_rows, spec.width_px
+    if spec.kind == "depth":
+        bytes_of = (body_bytes if spec.layout == "body" else paper_bytes)(spec.range_m)
+
+        def network(image: NDArray[Any]) -> NDArray[np.uint8]:
+            return shrink.depth(image, rows, columns, bytes_of)[:, None]
+    else:
+
+        def network(image: NDArray[Any]) -> NDArray[np.uint8]:
+            return shrink.colour(image, rows, columns)
+
+    newest = network(seen.image)
+    if spec.frames == 1:
+        return newest
+    blank, channels = (255 if spec.kind == "depth" else 0), CHANNELS[spec.kind]
+    stack = np.full((len(newest), spec.channels, rows, columns), blank, np.uint8)
+    for k, image in enumerate((seen.image, *seen.earlier[: spec.frames - 1])):
+        stack[:, k * channels : (k + 1) * channels] = newest if k == 0 else network(image)
     return stack
 
 
@@ -283,12 +294,12 @@ def _own_boxes(spec: ObservationSpec) -> dict[str, Box]:
     wrong = [
         f"{key} {np.dtype(box.dtype)} {box.shape}"
         for key, box in found.items()
-        if len(box.shape) != (3 if key == DEPTH else 1)
-        or np.dtype(box.dtype) != np.dtype(np.uint8 if key == DEPTH else np.float32)
+        if len(box.shape) != (3 if key == spec.kind else 1)
+        or np.dtype(box.dtype) != np.dtype(np.uint8 if key == spec.kind else np.float32)
     ]
-    if wrong or DEPTH not in found:
+    if wrong or spec.kind not in found:
         problem = f"its arrays are {', '.join(wrong) or ', '.join(found)}"
-        wanted = f"{DEPTH} uint8 (channels, height, width), all others float32 (k,)"
+        wanted = f"{spec.kind} uint8 (channels, height, width), all others float32 (k,)"
         raise FieldError(
             plugins.LAYOUTS.field, spec.layout, problem=f"{problem}; accepted: {wanted}"
         )
@@ -326,54 +337,24 @@ def _own(name: str) -> Layout:
         raise FieldError(door.field, name, problem=problem) from error
 
 
+def newest_frame(spec: ObservationSpec, seen: Mapping[str, NDArray[Any]]) -> NDArray[np.uint8]:
+    """Return a copy of the newest frame that one vehicle's network sees, as a picture.
+
+    Args:
+        spec: The layout.
+        seen: Its arrays, without a leading axis.
+
+    Returns:
+        (h, w); of rgb (h, w, 3).
+    """
+    channels = seen[spec.kind][: CHANNELS[spec.kind]]
+    picture: NDArray[np.uint8] = np.ascontiguousarray(np.moveaxis(channels, 0, -1))
+    return picture.copy() if spec.kind == "rgb" else picture[..., 0].copy()
+
+
 def ablated(encoded: Mapping[str, NDArray[Any]], key: str) -> Encoded:
     """Return the arrays with one input made zero, as the paper's sensor ablation does."""
     return {k: np.zeros_like(v) if k == key else v for k, v in encoded.items()}
-
-
-def nearest_returns(depth_mm: NDArray[np.uint16], rows: int, columns: int) -> NDArray[np.uint16]:
-    """Shrink Z16 images (n, h, w) to (n, rows, columns): the nearest return of each block wins.
-
-    Values are one less than in the images, so that "no return" (0) wraps round to the farthest.
-    """
-    image = depth_mm - np.uint16(1)
-    vertical, horizontal = depth_mm.shape[1] // rows, depth_mm.shape[2] // columns
-    nearest = image[:, ::vertical]
-    for k in range(1, vertical):
-        nearest = np.minimum(nearest, image[:, k::vertical])
-    image, nearest = nearest, nearest[:, :, ::horizontal]
-    for k in range(1, horizontal):
-        nearest = np.minimum(nearest, image[:, :, k::horizontal])
-    return nearest
-
-
-def _depths_m(range_m: float) -> NDArray[np.float64]:
-    """Return the depth [m] of every value of `nearest_returns`; infinite beyond the range."""
-    depth = (np.arange(MAX_MM + 1) + 1) / MM_PER_M
-    depth[(depth > range_m) | (np.arange(MAX_MM + 1) == MAX_MM)] = np.inf
-    return depth
-
-
-@cache
-def _body_bytes(range_m: float) -> Bytes:
-    """Depth in proportion to the range: 0 is at the lens, 255 the range and beyond."""
-    share = np.minimum(_depths_m(range_m) / range_m, 1.0)
-    table = np.rint(255.0 * share).astype(np.uint8)
-    far_mm = range_m * MM_PER_M
-    values = np.arange(1, MAX_MM + 2).astype(np.float32)
-    ratios = np.float32(255.0) * values / np.float32(far_mm)
-    in_single = np.rint(np.minimum(ratios, np.float32(255.0))).astype(np.uint8)
-    return Bytes(table, far_mm if np.array_equal(in_single, table) else 0.0)
-
-
-@cache
-def _paper_bytes(range_m: float) -> Bytes:
-    """Air Learning's mapping (airlearning-rl, getScreenDepthVis).
-
-    255 / max(1 m, depth) cut to a byte, inverted, to the tenth power of the byte's range.
-    """
-    byte = (255.0 / np.maximum(1.0, _depths_m(range_m))).astype(np.uint8)
-    return Bytes((255.0 * ((255.0 - byte) / 255.0) ** 10).astype(np.uint8))
 
 
 def _bearing_strip(spec: ObservationSpec, seen: Observation) -> NDArray[np.uint8]:

@@ -62,10 +62,12 @@ def _page(card: PolicyCard) -> Iterator[str]:
     yield from ("A policy of airl-mav that flies a quadcopter to a goal. In this folder:", "")
     yield from ("```sh", "airl-sitl --policy .", "airl evaluate . --episodes 100", "```", "")
     yield from ("| | |", "|---|---|")
-    image = "depth image" if seen.projection == "pinhole" else f"{seen.projection} depth image"
+    image = f"{seen.kind} image"
+    image = image if seen.projection == "pinhole" else f"{seen.projection} {image}"
+    far = f", up to {seen.range_m:g} m" if seen.kind == "depth" else ""
     yield (
         f"| sees | {image} of {seen.width_px}x{seen.height_px} px, {seen.horizontal_fov_deg:g} "
-        f"deg wide, up to {seen.range_m:g} m; own velocity; goal (layout `{seen.layout}`) |"
+        f"deg wide{far}; own velocity; goal (layout `{seen.layout}`) |"
     )
     yield f"| decides | `{actions.set}`, up to {actions.max_speed_m_s:.3g} m/s |"
     yield f"| holds each action | {card.hold_s:g} s |"

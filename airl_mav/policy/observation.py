@@ -1,4 +1,4 @@
-"""What a policy sees: a depth image, its own motion and the goal.
+"""What a policy sees: an image, its own motion and the goal.
 
 One function for all: `observe` turns frames and the vehicles' telemetry into an Observation, of
 one vehicle in the companion and of n at a time in training.
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.camera.frame import MM_PER_M, Frame
+from airl_mav.camera.frame import MM_PER_M, Frame, depth_only
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.frames import Vector, ned_to_heading, quats_to_euler
 
@@ -63,8 +63,11 @@ class Observation:
     The heading frame is level and follows the nose: forward, right, down.
     """
 
-    depth_mm: NDArray[np.uint16]  # (..., h, w) along the optical axis [mm]; 0 = no return
+    image: NDArray[Any]
+    """(..., h, w) depth uint16 along the optical axis [mm], 0 = no return; or colour uint8
+    (..., h, w, 3) sRGB, (..., h, w, 1) grey."""
     intrinsics: Intrinsics
+    """Of the camera; its `kind` says what the image's pixels are."""
     goal: Vector  # (..., 2) goal relative to the vehicle, forward and right [m]
     velocity: Vector  # (..., 3) heading frame [m/s]
     roll: float | Vector
@@ -75,17 +78,30 @@ class Observation:
     """(...) heading [rad], 0 = north, positive to the east."""
     in_flight: InFlight | None = None
     """None: nobody keeps account of the decisions."""
-    earlier_mm: tuple[NDArray[np.uint16], ...] = ()
-    """The images (..., h, w) of the decisions before, as far as they are kept, the newest first."""
+    earlier: tuple[NDArray[Any], ...] = ()
+    """The images of the decisions before, as far as they are kept, the newest first."""
 
     def rows(self, index: Rows) -> Observation:
         """Return what vehicle `index` of n sees, or several of them."""
-        names = ("depth_mm", "goal", "velocity", "roll", "pitch", "yaw")
+        names = ("image", "goal", "velocity", "roll", "pitch", "yaw")
         found: dict[str, Any] = {name: np.asarray(getattr(self, name))[index] for name in names}
         if (told := self.in_flight) is not None:
             found["in_flight"] = told.rows(index)
-        found["earlier_mm"] = tuple(image[index] for image in self.earlier_mm)
+        found["earlier"] = tuple(image[index] for image in self.earlier)
         return replace(self, **found)
+
+    @property
+    def depth_mm(self) -> NDArray[np.uint16]:
+        """Depth (..., h, w) along the optical axis [mm]; 0 = no return.
+
+        Raises UsageError for a colour camera, as the next two do.
+        """
+        return depth_only(self.image, self.intrinsics)
+
+    @property
+    def earlier_mm(self) -> tuple[NDArray[np.uint16], ...]:
+        """Depths (..., h, w) [mm] of the decisions before, as far as they are kept."""
+        return tuple(depth_only(image, self.intrinsics) for image in self.earlier)
 
     @property
     def depth_m(self) -> NDArray[np.float32]:
@@ -105,32 +121,32 @@ class Observation:
 
 def encode(frame: Frame, state: Kinematics, goal: tuple[float, float]) -> Observation:
     """Return the observation of a frame, telemetry and a goal (north, east [m])."""
-    return observe(frame.depth_mm, frame.intrinsics, state, np.asarray(goal, np.float64))
+    return observe(frame.image, frame.intrinsics, state, np.asarray(goal, np.float64))
 
 
 def observe(
-    depth_mm: NDArray[np.uint16],
+    image: NDArray[Any],
     intrinsics: Intrinsics,
     state: Kinematics,
     goal: Vector,
     in_flight: InFlight | None = None,
-    earlier_mm: tuple[NDArray[np.uint16], ...] = (),
+    earlier: tuple[NDArray[Any], ...] = (),
 ) -> Observation:
     """Return the observation of one vehicle, or of n.
 
     Args:
-        depth_mm: (..., h, w) Z16 images [mm]; 0 = no return.
+        image: As `Observation.image`.
         intrinsics: The camera.
         state: Telemetry.
         goal: (..., 2) north, east [m].
         in_flight: What is known of the decisions; None: nothing is.
-        earlier_mm: Images of the decisions before, the newest first.
+        earlier: Images of the decisions before, the newest first.
     """
     roll, pitch, yaw = quats_to_euler(state.quaternion)
     to_goal = np.zeros_like(state.position)
     to_goal[..., :2] = goal - state.position[..., :2]
     return Observation(
-        depth_mm=depth_mm,
+        image=image,
         intrinsics=intrinsics,
         goal=ned_to_heading(to_goal, yaw)[..., :2],
         velocity=ned_to_heading(state.velocity, yaw),
@@ -138,5 +154,5 @@ def observe(
         pitch=pitch,
         yaw=yaw,
         in_flight=in_flight,
-        earlier_mm=earlier_mm,
+        earlier=earlier,
     )

@@ -13,11 +13,12 @@ from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.plugins import POLICIES as DOOR
 from airl_mav.core.plugins import announced, digest_of, load_part, names_code, reference
 from airl_mav.policy.actions import Policy
-from airl_mav.policy.card import CARD_FILE, ONNX_FILE, PolicyCard, load_card
+from airl_mav.policy.card import CARD_FILE, ONNX_FILE, PolicyCard, load_card, vehicle_mismatch
 from airl_mav.policy.greedy import GreedyPolicy, GreedySettings
 from airl_mav.policy.learned import load_learned
 from airl_mav.policy.runtime import RuntimeName
 from airl_mav.profiles.loading import profiles_dir
+from airl_mav.profiles.vehicle import Camera
 
 POLICIES: dict[str, tuple[str, Callable[[float], Policy]]] = {
     "greedy": (
@@ -53,6 +54,18 @@ class PolicyInfo:
     def macs(self) -> int | None:
         """Multiply-accumulates of one inference."""
         return None if self.card is None else self.card.macs
+
+
+def camera_refused(policy: PolicyInfo, camera: Camera) -> str | None:
+    """Return why a vehicle's camera cannot serve a policy, or None when it can, as far as is known.
+
+    Of a policy that is written in Python nothing is.
+    """
+    if policy.card is not None:
+        return vehicle_mismatch(policy.card, camera)
+    if policy.program is None and camera.kind != "depth":
+        return f"{camera.kind} camera; accepted: depth"
+    return None
 
 
 def policy_names() -> list[str]:

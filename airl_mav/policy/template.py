@@ -18,7 +18,7 @@ from airl_mav.core.files import replace_file
 from airl_mav.policy.action_sets import ActionSpec
 from airl_mav.policy.card import ONNX_FILE, PolicyCard, PolicyFacts, digest
 from airl_mav.policy.card_writing import write_card
-from airl_mav.policy.layouts import DEPTH, GOAL, VELOCITY, ObservationSpec
+from airl_mav.policy.layouts import GOAL, VELOCITY, ObservationSpec
 from airl_mav.policy.runtime import ACTION, outputs_of
 
 OPSET = 18
@@ -39,11 +39,12 @@ class Size(NamedTuple):
     """Multiply-accumulates of one inference."""
 
 
-def template_size(layers: int, filters: int, height_px: int, width_px: int, outputs: int) -> Size:
-    """Return the size of a network of the template."""
+def template_size(
+    layers: int, filters: int, height_px: int, width_px: int, outputs: int, channels: int = 1
+) -> Size:
+    """Return the size of a network of the template; `channels` are those of its image."""
     pixels = height_px * width_px
     weights, biases, macs = 0, 0, 0
-    channels = 1
     for _ in range(layers):
         kernel = KERNEL * KERNEL * channels * filters
         weights, biases, macs = weights + kernel, biases + filters, macs + kernel * pixels
@@ -71,7 +72,7 @@ def write_template(
         UsageError: The network is too large for one .onnx file.
     """
     spec, outputs = facts.observation, outputs_of(facts.actions)
-    size = template_size(layers, filters, spec.height_px, spec.width_px, outputs)
+    size = template_size(layers, filters, spec.height_px, spec.width_px, outputs, spec.channels)
     if 4 * size.parameters > GREATEST_BYTES:
         raise UsageError(
             f"--network {layers}x{filters}: {size.parameters:,} parameters; accepted: at most "
@@ -124,8 +125,8 @@ def build_template(
         return output
 
     full = add("full_scale", np.array(255.0, np.float32))
-    x = node("Div", [node("Cast", [DEPTH], "pixels", to=TensorProto.FLOAT), full], "image")
-    channels = 1
+    x = node("Div", [node("Cast", [spec.kind], "pixels", to=TensorProto.FLOAT), full], "image")
+    channels = spec.channels
     for k in range(layers):
         kernel = random(f"conv{k}.weight", (filters, channels, KERNEL, KERNEL))
         x = node(
@@ -147,12 +148,12 @@ def build_template(
     outputs = outputs_of(actions)
     last = [x, random("score.weight", (outputs, inputs)), zeros("score.bias", outputs)]
     node("Gemm", last, ACTION, transB=1)
-    image = ["n", 1, spec.height_px, spec.width_px]
+    image = ["n", spec.channels, spec.height_px, spec.width_px]
     graph = helper.make_graph(
         nodes,
         "template",
         [
-            helper.make_tensor_value_info(DEPTH, TensorProto.UINT8, image),
+            helper.make_tensor_value_info(spec.kind, TensorProto.UINT8, image),
             helper.make_tensor_value_info(VELOCITY, TensorProto.FLOAT, ["n", 3]),
             helper.make_tensor_value_info(GOAL, TensorProto.FLOAT, ["n", 3]),
         ],

@@ -57,8 +57,16 @@ class Compensator:
         So many images are `remembered`: the newest, and those that fill what it did not see.
 
         Raises:
-            FieldError: The vehicle's profile does not say how it answers setpoints.
+            FieldError: The vehicle's profile does not say how it answers setpoints, or the camera
+                gives no depth.
         """
+        if intrinsics.kind != "depth":
+            raise FieldError(
+                "compensate",
+                True,
+                problem=f"the vehicle has a camera of kind {intrinsics.kind!r}, and only depth can"
+                " be carried forward; accepted: no compensation, or a depth camera",
+            )
         if vehicle.response is None:
             raise FieldError(
                 "compensate",

@@ -15,6 +15,7 @@ from pydantic import (
 from airl_mav.core.constants import C_PER_MAH, GRAVITY_M_S2, US_PER_S
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import ProfileModel, quantity
+from airl_mav.profiles.camera_kind import CameraKind
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.parameters import SPECS, parameter_values
 from airl_mav.profiles.projection import CYLINDER_MOST_DEG, Projection, check_fov
@@ -178,8 +179,13 @@ class Stereo(ProfileModel):
 
 
 class Camera(ProfileModel):
-    """The depth camera, which looks ahead or all round."""
+    """The camera, which looks ahead or all round."""
 
+    kind: CameraKind = Field(
+        default="depth",
+        description="what its pixels are: depth; rgb, sRGB colours of 8 bits a channel; or grey,"
+        " their luma (ITU-R BT.601)",
+    )
     projection: Projection = Field(
         default="pinhole",
         description="pinhole, or cylindrical for a field of view of up to 360 deg",
@@ -192,13 +198,17 @@ class Camera(ProfileModel):
         gt=10,
         le=CYLINDER_MOST_DEG,
     )
-    range_m: float = quantity("farthest depth returned", "m", gt=0.5, le=65)
+    range_m: float = quantity(
+        "farthest depth returned; rgb and grey cameras see without limit", "m", gt=0.5, le=65
+    )
     rate_hz: float = quantity("frames a second", "Hz", ge=1, le=125)
     forward_m: float = quantity("mount ahead of the centre of mass", "m", ge=-2, le=2)
     up_m: float = quantity("mount above the centre of mass", "m", ge=-2, le=2)
     pitch_up_deg: float = quantity("mount angle, positive looks up", "deg", ge=-90, le=90)
     stereo: Stereo | None = Field(
-        default=None, description="how depth is matched; left out: depth without error"
+        default=None,
+        description="how depth is matched, of a depth camera with a pinhole; left out: depth"
+        " without error",
     )
 
     @model_validator(mode="after")
@@ -208,12 +218,15 @@ class Camera(ProfileModel):
             raise FieldError(
                 "camera.stereo", self.projection, "left out where the projection is not pinhole"
             )
+        check_matched("camera.kind", self)
         return self
 
     @model_serializer(mode="wrap")
     def _without_the_default(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        # Profiles that say neither projection nor stereo matching keep their digests.
+        # Profiles that say neither kind nor projection nor stereo matching keep their digests.
         data: dict[str, Any] = dump(self)
+        if self.kind == "depth":
+            data.pop("kind", None)
         if self.projection == "pinhole":
             data.pop("projection", None)
         if self.stereo is None:
@@ -224,6 +237,14 @@ class Camera(ProfileModel):
     def period_us(self) -> int:
         """Time between two frames [µs]."""
         return round(US_PER_S / self.rate_hz)
+
+
+def check_matched(field: str, camera: Camera) -> None:
+    """Raise FieldError, naming the field, for stereo matching where no depth is measured."""
+    if camera.stereo is not None and camera.kind != "depth":
+        raise FieldError(
+            field, camera.kind, problem="with a table camera.stereo; accepted: 'depth' with one"
+        )
 
 
 class Imu(ProfileModel):
@@ -396,6 +417,11 @@ class VehicleProfile(ProfileModel):
             f"{thrust_n:.2f} ({len(CORNERS)} x rotor.thrust_max_n "
             f"{thrust_share * self.rotor.thrust_max_n:g})"
         )
+
+    @property
+    def compensable(self) -> bool:
+        """Whether what its camera sees can be carried forward: its response is known, and depth."""
+        return self.response is not None and self.camera.kind == "depth"
 
     @property
     def thrust_n(self) -> float:

@@ -104,16 +104,17 @@ def cold_start(request: ProfileRequest, policy: PolicyUnderTest) -> tuple[int, i
 def random_observations(
     request: ProfileRequest, policy: PolicyUnderTest
 ) -> list[tuple[Frame, Kinematics]]:
-    """Return depth images of noise, as large as the camera's, and states of a level vehicle."""
+    """Return images of noise, as large as the camera's, and states of a level vehicle."""
     spec, lens = policy.card.observation, policy.camera
     if camera_mismatch(spec, lens) is not None:
         fov = math.radians(spec.horizontal_fov_deg)
-        lens = Intrinsics.from_fov(spec.width_px, spec.camera_rows, fov, spec.projection)
+        lens = Intrinsics.from_fov(spec.width_px, spec.camera_rows, fov, spec.projection, spec.kind)
     rng = np.random.default_rng((request.seed, OBSERVATION_STREAM))
     level = np.array([1.0, 0.0, 0.0, 0.0])
+    brightest = 20_000 if lens.kind == "depth" else 256
     return [
         (
-            Frame(k, 0, rng.integers(0, 20_000, (lens.height, lens.width), np.uint16), lens),
+            Frame(k, 0, rng.integers(0, brightest, lens.shape, lens.dtype), lens),
             Kinematics(rng.normal(0.0, 5.0, 3), rng.normal(0.0, 2.0, 3), level),
         )
         for k in range(OBSERVATIONS)

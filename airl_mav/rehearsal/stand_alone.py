@@ -8,6 +8,7 @@ from contextlib import closing
 from dataclasses import dataclass, field
 
 from airl_mav.arena.generate import generate
+from airl_mav.camera.noise import check_noise
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loaded import check_spread, equipped
 from airl_mav.profiles.loading import load_profile
@@ -98,6 +99,7 @@ def aircraft_of(asked: StandAloneVehicle) -> tuple[VehicleProfile, float]:
     """
     vehicle, computer = equipped(asked.vehicle, asked.computer, asked.payload)
     check_spread(vehicle, asked.spread)
+    check_noise(vehicle.camera, asked.sensors, asked.faults)
     return vehicle, computer.onboard_watts
 
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from functools import cache
+from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
 from numpy.typing import NDArray
 
-from airl_mav.camera.frame import MM_PER_M
+from airl_mav.camera.frame import MM_PER_M, rgb_of
 
 NO_RETURN = "#262a30"
 """Colour of pixels that the camera has no depth of: that of the live view."""
@@ -40,3 +41,8 @@ def coloured(depth_mm: NDArray[np.uint16], range_m: float) -> NDArray[np.uint8]:
     table = np.array([[int(c[k : k + 2], 16) for k in (1, 3, 5)] for c in palette()], np.uint8)
     picture: NDArray[np.uint8] = table[shades(depth_mm, range_m)]
     return picture
+
+
+def pictured(image: NDArray[Any], range_m: float) -> NDArray[np.uint8]:
+    """Return a camera's image, `camera.frame.Frame.image`, for people: RGB (h, w, 3)."""
+    return rgb_of(image) if image.ndim == 3 else coloured(image, range_m)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.camera.frame import rgb_of
 from airl_mav.core.constants import US_PER_MS
 from airl_mav.core.files import Arrays
 from airl_mav.latency.series import decision_series
@@ -26,7 +27,7 @@ UNITS = {"_m_s": 0.01, "_m": 0.01, "_deg": 0.1, "_deg_s": 0.1}
 """Numbers are kept to half of this, by the unit that a name ends with."""
 
 IMAGES = 24
-"""Decisions of a flight with a depth image: all, or the first, the last and some between."""
+"""Decisions of a flight with an image: all, or the first, the last and some between."""
 
 LAST = 8
 """Of them, so many are the last: they led to the end."""
@@ -114,8 +115,11 @@ def _stages(stamps: Arrays) -> dict[str, list[float | None]]:
 
 def _seen(decision: SeenDecision, range_m: float, again: PolicyAgain | None) -> Mapping[str, Any]:
     """Return one decision: its image as base64 of bytes, and its best actions."""
-    height, width = decision.depth_mm.shape
-    image = base64.b64encode(shades(decision.depth_mm, range_m).tobytes()).decode()
+    seen = decision.image
+    height, width = seen.shape[:2]
+    # A byte of the palette a pixel of depth, three of colour.
+    pixels = rgb_of(seen) if seen.ndim == 3 else shades(seen, range_m)
+    image = base64.b64encode(pixels.tobytes()).decode()
     told: dict[str, Any] = {"number": decision.number, "size": [width, height], "image": image}
     if decision.scores is not None and again is not None:
         best = np.argsort(-decision.scores, kind="stable")[:BEST]

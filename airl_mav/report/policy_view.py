@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena
-from airl_mav.camera.frame import depth_to_z16
-from airl_mav.camera.render import camera_pose, render
+from airl_mav.camera.exposure import expose
+from airl_mav.camera.render import camera_pose
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import Arrays
@@ -49,8 +50,8 @@ class SeenDecision:
 
     number: int
     """Its row in `latency.npz`."""
-    depth_mm: NDArray[np.uint16]
-    """(h, w) what the policy saw [mm]; 0 = no return."""
+    image: NDArray[Any]
+    """What the policy saw, as `camera.frame.Frame.image`."""
     scores: NDArray[np.float32] | None
     """(k,) of each discrete action, as the network gives them; None: nothing tells them."""
     again: bool | None
@@ -132,7 +133,7 @@ def seen_decisions(
             scores = policy.outputs(encoded)[0]
             best = again.actions[int(np.argmax(scores))]
             same = bool(np.abs(best - setpoint[[0, 1, 3]]).max() < SAME_ACTION)
-        yield SeenDecision(number, seen.depth_mm, scores, same)
+        yield SeenDecision(number, seen.image, scores, same)
         stops = None if hover_s is None else sent + round((lasts_s + hover_s) * US_PER_S)
         companion.decided(setpoint, ready - began, sent, stops)
 
@@ -146,13 +147,13 @@ class _Lens:
     path: Trajectory
     started_us: int
 
-    def image(self, time_us: int) -> NDArray[np.uint16]:
-        """Return what is seen (h, w) [mm] at a time."""
+    def image(self, time_us: int) -> NDArray[Any]:
+        """Return what is seen at a time."""
         position, _, quaternion = pose_at(self.path, time_us)
         eye, attitude = camera_pose(position, quaternion, self.camera.mount)
         centers = self.arena.centers_at(time_us - self.started_us)
         lens, range_m = self.camera.intrinsics, self.camera.range_m
-        return depth_to_z16(render(self.arena, centers, lens, range_m, eye, attitude))
+        return expose(self.arena, centers, lens, range_m, eye, attitude)
 
 
 class _Companion:
@@ -161,18 +162,18 @@ class _Companion:
     def __init__(self, vehicle: VehicleProfile, camera: PolicyCamera, *, compensates: bool) -> None:
         self._intrinsics = camera.intrinsics
         self._compensator = None
-        if compensates and vehicle.response is not None:
+        if compensates and vehicle.compensable:
             self._compensator = Compensator(1, vehicle, camera.intrinsics)
             self._compensator.begin(0)
             self._memory = self._compensator.memory
         else:
             self._memory = DecisionMemory(1)
             self._memory.begin(0)
-        self._earlier: tuple[NDArray[np.uint16], ...] = ()
+        self._earlier: tuple[NDArray[Any], ...] = ()
 
     def observe(
         self,
-        depth_mm: NDArray[np.uint16],
+        image: NDArray[Any],
         state: Kinematics,
         goal: tuple[float, float],
         age_us: int,
@@ -182,15 +183,15 @@ class _Companion:
         age = np.array([age_us])
         if self._compensator is not None:
             images, states = self._compensator.foresee(
-                ONE, depth_mm[None], age, np.array([now_us]), state.rows(None)
+                ONE, image[None], age, np.array([now_us]), state.rows(None)
             )
-            depth_mm, state = images[0], states.rows(0)
+            image, state = images[0], states.rows(0)
         told = self._memory.in_flight(age).rows(0)
         earlier = self._earlier
-        self._earlier = (depth_mm, *earlier)[: MOST_FRAMES - 1]
+        self._earlier = (image, *earlier)[: MOST_FRAMES - 1]
         where = np.asarray(goal, np.float64)
         in_flight = InFlight(told.command, told.latency_s, told.age_s)
-        return observe(depth_mm, self._intrinsics, state, where, in_flight, earlier)
+        return observe(image, self._intrinsics, state, where, in_flight, earlier)
 
     def decided(
         self, setpoint: NDArray[np.float64], t2_us: int, sent_us: int, stops_us: int | None

@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from airl_mav.report import theme
-from airl_mav.report.depth_colours import coloured
+from airl_mav.report.depth_colours import pictured
 from airl_mav.report.faults import fault_spans_s
 from airl_mav.report.policy_view import SeenDecision
 from airl_mav.report.tracking import Commands, Floats, TrackedFlight
@@ -52,7 +52,7 @@ def tracking_figure(
 
     Args:
         flight: What is drawn.
-        seen: Decisions whose depth images stand above the rows, `IMAGES` of them at most.
+        seen: Decisions whose images stand above the rows, `IMAGES` of them at most.
         range_m: Farthest depth that the camera returns [m].
     """
     rows = _rows(flight)
@@ -68,7 +68,7 @@ def tracking_figure(
     for ax, (label, lines) in zip(axes, rows, strict=True):
         _draw_row(ax, flight, label, lines, keep)
     for image, ax in zip(seen, _strip(figure, seen, height), strict=True):
-        ax.imshow(coloured(image.depth_mm, range_m), interpolation="nearest", aspect="equal")
+        ax.imshow(pictured(image.image, range_m), interpolation="nearest", aspect="equal")
         at = flight.commands.sent_s[min(image.number, len(flight.commands.sent_s) - 1)]
         ax.set_title(f"{at:.1f} s", fontsize=7.5, color=theme.MUTED, pad=2)
         for row in axes:

@@ -36,7 +36,7 @@ GREATEST_ZONE = 100
 
 LevelName = Literal["gym", "lockstep", "sitl"]
 RuntimeName = Literal["onnx", "torch"]
-AblationName = Literal["depth", "velocity", "goal"]
+AblationName = Literal["depth", "rgb", "grey", "velocity", "goal"]
 
 
 def _seed(description: str, default: Any = 1) -> Any:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from airl_mav.camera.noise import check_noise
 from airl_mav.core.errors import FieldError
 from airl_mav.flight.judge import GOAL_RADIUS_M
 from airl_mav.latency.injection import Injection, without_timing
 from airl_mav.latency.source import select_injection
-from airl_mav.policy.card import vehicle_mismatch
-from airl_mav.policy.registry import find_policy
+from airl_mav.policy.registry import camera_refused, find_policy
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loaded import check_spread, equipped
 from airl_mav.profiles.loading import load_profile
@@ -37,7 +37,8 @@ def resolve(scenario: Scenario) -> ResolvedScenario:
     pilot, watchdog = decide_piloting(scenario, policy, GOAL_RADIUS_M)
     vehicle, computer = equipped(scenario.vehicle, scenario.computer, scenario.payload)
     check_spread(vehicle, scenario.spread)
-    if policy.card is not None and (reason := vehicle_mismatch(policy.card, vehicle.camera)):
+    check_noise(vehicle.camera, scenario.sensors, scenario.faults)
+    if reason := camera_refused(policy, vehicle.camera):
         raise FieldError(
             "policy", scenario.policy, problem=f"does not fit vehicle {scenario.vehicle}: {reason}"
         )

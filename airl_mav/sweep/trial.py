@@ -11,6 +11,8 @@ from airl_mav.envs.evaluation import OUTCOMES, EpisodeResult, mean_of_successes
 from airl_mav.flight.judge import Outcome
 from airl_mav.policy.runtime import outputs_of
 from airl_mav.policy.template import Size, template_size
+from airl_mav.profiles.camera_kind import CHANNELS
+from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.sweep.config import SweepConfig
 from airl_mav.training.config import NetworkSpec, TrainingConfig
 
@@ -77,12 +79,14 @@ def training_of(config: SweepConfig, trial: Trial) -> TrainingConfig:
 def size_of(config: SweepConfig, trial: Trial) -> Size:
     """Return the size of a trial's network, as it flies."""
     environment = config.training.environment
+    camera = environment.camera.of(load_vehicle(environment.vehicle).camera)
     return template_size(
         trial.layers,
         trial.filters,
         environment.image_height_px,
         environment.image_width_px,
         outputs_of(environment.action_spec),
+        CHANNELS[camera.kind] * environment.frames,
     )
 
 

@@ -21,8 +21,9 @@ from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.plugins import MODELS, load_part
 from airl_mav.policy.action_sets import ActionSpec, discrete_actions
 from airl_mav.policy.card import PolicyCard, PolicyFacts
-from airl_mav.policy.layouts import DEPTH, GOAL, IN_FLIGHT, VELOCITY, ObservationSpec, boxes
+from airl_mav.policy.layouts import GOAL, IN_FLIGHT, VELOCITY, ObservationSpec, boxes
 from airl_mav.policy.runtime import CONTINUOUS_OUTPUTS, first_line
+from airl_mav.profiles.camera_kind import CHANNELS, KINDS
 from airl_mav.training.export_request import ExportRequest, Taken
 from airl_mav.training.onnx_export import (
     TOLERANCE,
@@ -33,8 +34,14 @@ from airl_mav.training.onnx_export import (
 )
 from airl_mav.training.recurrent import RecurrentNetwork
 
-SHIPPED_INPUTS = (DEPTH, VELOCITY, GOAL)
-"""What the shipped layouts give where nothing else is told."""
+DEPTH = "depth"
+"""Key of the image where the camera gives depth."""
+
+VECTORS = (VELOCITY, GOAL)
+"""What the shipped layouts give beside the image where nothing else is told."""
+
+USUAL = (DEPTH, *VECTORS)
+"""What most networks take."""
 
 CHECKED = 64
 """Random observations on which the model's own decisions are compared."""
@@ -75,8 +82,8 @@ class _ToldNetwork(nn.Module):
         return found
 
 
-class _OwnNetwork(nn.Module):
-    """The same of a network with a layout of the user's: any arrays, in the order of their keys."""
+class _AnyNetwork(nn.Module):
+    """The same of a network that takes any arrays, in the order of these keys."""
 
     def __init__(self, inner: nn.Module, keys: Sequence[str]) -> None:
         super().__init__()
@@ -124,11 +131,17 @@ def network_of(model: BaseAlgorithm) -> nn.Module:
     """
     policy: Any = model.policy
     keys = tuple(sorted(policy.observation_space.spaces))
-    usual = set(keys) == set(SHIPPED_INPUTS)
-    network: Callable[[nn.Module], nn.Module] = _Network
-    if not usual:
-        told = set(keys) == {*SHIPPED_INPUTS, IN_FLIGHT}
-        network = _ToldNetwork if told else partial(_OwnNetwork, keys=keys)
+    image = next((key for key in keys if key in KINDS), DEPTH)
+    usual = set(keys) == {image, *VECTORS}
+    network: Callable[[nn.Module], nn.Module]
+    if usual or set(keys) == {image, *VECTORS, IN_FLIGHT}:
+        network = _Network if usual else _ToldNetwork
+        if image != DEPTH:
+            # In the order in which the layout has them.
+            told = () if usual else (IN_FLIGHT,)
+            network = partial(_AnyNetwork, keys=(image, *VECTORS, *told))
+    else:
+        network = partial(_AnyNetwork, keys=keys)
     if hasattr(policy, "quantile_net"):
         return network(_MeanOfQuantiles(policy.quantile_net))
     if hasattr(policy, "q_net"):
@@ -152,10 +165,10 @@ def network_of(model: BaseAlgorithm) -> nn.Module:
             if not usual:
                 raise UsageError(
                     f"a network with a memory of its own takes {', '.join(keys)}; accepted:"
-                    f" {', '.join(SHIPPED_INPUTS)}"
+                    f" {', '.join((image, *VECTORS))}"
                 )
             head = nn.Sequential(hidden, policy.action_net, last)
-            return RecurrentNetwork(_Actor(policy, extractor), policy.lstm_actor, head)
+            return RecurrentNetwork(_Actor(policy, extractor), policy.lstm_actor, head, image)
         return network(_Actor(policy, extractor, hidden, policy.action_net, last))
     raise UsageError(f"{type(model).__name__}: its {type(policy).__name__} cannot be exported")
 
@@ -170,7 +183,7 @@ def check_spaces(model: BaseAlgorithm, spec: ObservationSpec, actions: ActionSpe
         isinstance(part, spaces.Box)
         and part.shape == wanted[key][0]
         # SB3 turns all floats into float32.
-        and (part.dtype == np.uint8 if key == DEPTH else part.dtype.kind == "f")
+        and (part.dtype == np.uint8 if key == spec.kind else part.dtype.kind == "f")
         for key, part in parts.items()
     )
     if not fits:
@@ -217,7 +230,7 @@ def export(asked: ExportRequest, command: str) -> PolicyCard:
     write: Callable[[PolicyFacts], PolicyCard]
     if asked.own_module:
         facts = asked.facts(command)
-        module = load_module(asked.model, asked.weights)
+        module = load_module(asked.model, asked.weights, tuple(boxes(facts.observation)))
         write = partial(export_network, module, folder=out, with_torch=asked.with_torch)
     else:
         learner = load_sb3(Path(asked.model), asked.algorithm or "")
@@ -234,20 +247,22 @@ def export(asked: ExportRequest, command: str) -> PolicyCard:
 def taken_by(model: BaseAlgorithm) -> Taken:
     """Return what a model's spaces say of the image and the action set."""
     seen, space = model.observation_space, model.action_space
-    depth = seen.spaces.get(DEPTH) if isinstance(seen, spaces.Dict) else None
-    shape = None if depth is None else depth.shape
+    images = seen.spaces if isinstance(seen, spaces.Dict) else {}
+    kind = next((key for key in KINDS if key in images), None)
+    shape = None if kind is None else images[kind].shape
     actions = "velocity" if isinstance(space, spaces.Box) else None
-    if shape is None or len(shape) != 3:
+    if kind is None or shape is None or len(shape) != 3:
         return Taken(actions=actions)
-    return Taken(f"{shape[2]}x{shape[1]}", shape[0], actions)
+    return Taken(f"{shape[2]}x{shape[1]}", shape[0] // CHANNELS[kind], actions, kind)
 
 
-def load_module(name: str, weights: Path | None) -> nn.Module:
+def load_module(name: str, weights: Path | None, keys: Sequence[str] = USUAL) -> nn.Module:
     """Return a module of the user's, in the form that `export_network` takes.
 
     Args:
         name: The module, its class, or a function that makes it, as `core.plugins` names code.
         weights: Its `state_dict`, as `torch.save` wrote it; None: it comes with its weights.
+        keys: Of its layout's arrays, in their order.
 
     Raises:
         UsageError: It cannot be made, or the weights are not its.
@@ -268,7 +283,9 @@ def load_module(name: str, weights: Path | None) -> nn.Module:
         if each.default is each.empty and each.kind is not each.VAR_KEYWORD
     ]
     # One argument: the Dict of observations, as in a training loop on the environment itself.
-    return _Network(module) if len(taken) == 1 else module
+    if len(taken) != 1:
+        return module
+    return _Network(module) if tuple(keys) == USUAL else _AnyNetwork(module, keys)
 
 
 def _load_weights(module: nn.Module, path: Path) -> None:

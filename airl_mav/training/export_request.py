@@ -19,6 +19,7 @@ from airl_mav.policy.action_sets import PAPER_SPEED_M_S, ActionSetName, ActionSp
 from airl_mav.policy.actions import DecisionTiming
 from airl_mav.policy.card import PolicyFacts, Training
 from airl_mav.policy.layouts import LayoutName, ObservationSpec
+from airl_mav.profiles.camera_kind import CameraKind
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.projection import Projection
 from airl_mav.profiles.vehicle import load_vehicle
@@ -27,13 +28,14 @@ from airl_mav.scenario.model import PilotSettings
 FLOWN = ("hold_s", "goal_radius_m", "altitude_m", "hover_after_s")
 """How a policy is flown: fields of the request, of a card and of an environment's episodes."""
 
-SEEN = ("layout", "frames", "projection", "horizontal_fov_deg", "range_m")
+SEEN = ("layout", "frames", "kind", "projection", "horizontal_fov_deg", "range_m")
 """What a policy sees but for the image's size: fields of the request and of a card."""
 
 DEFAULTS: dict[str, Any] = {
     "layout": "body",
     "image": "32x24",
     "frames": 1,
+    "kind": "depth",
     "projection": "pinhole",
     "horizontal_fov_deg": 90.0,
     "range_m": 20.0,
@@ -55,6 +57,7 @@ class Taken(NamedTuple):
     image: str | None = None
     frames: int | None = None
     actions: ActionSetName | None = None
+    kind: CameraKind | None = None
 
 
 class ExportRequest(BaseModel):
@@ -96,6 +99,11 @@ class ExportRequest(BaseModel):
         default=None,
         description="images that the network sees, of this decision and those before it; by default"
         " as the .zip says, or 1",
+    )
+    kind: CameraKind | None = Field(
+        default=None,
+        description="what the camera gives: depth, rgb or grey; by default as the .zip says, or"
+        " depth",
     )
     projection: Projection | None = Field(
         default=None, description="the camera's: pinhole or cylindrical; by default pinhole"
@@ -227,6 +235,7 @@ def _known_of(spec: EnvironmentSpec) -> dict[str, Any]:
         "layout": spec.layout,
         "image": f"{spec.image_width_px}x{spec.image_height_px}",
         "frames": spec.frames,
+        "kind": camera.kind,
         "projection": camera.projection,
         "horizontal_fov_deg": camera.horizontal_fov_deg,
         "range_m": camera.range_m,

@@ -15,7 +15,7 @@ from torch import nn
 
 from airl_mav.core.errors import UsageError
 from airl_mav.core.plugins import NETWORKS, load_part
-from airl_mav.policy.layouts import DEPTH, GOAL, IN_FLIGHT, VELOCITY
+from airl_mav.policy.layouts import GOAL, IN_FLIGHT, VELOCITY, image_key
 from airl_mav.training.config import NetworkSpec
 
 VECTORS = (VELOCITY, GOAL, IN_FLIGHT)
@@ -80,17 +80,19 @@ def flat_size(spec: NetworkSpec, height_px: int, width_px: int) -> int:
     return filters * height * width
 
 
-class DepthExtractor(BaseFeaturesExtractor):
-    """Convolutions over `depth` (n, frames, height, width), joined with `velocity`, `goal`, others.
+class ImageExtractor(BaseFeaturesExtractor):
+    """Convolutions over the image, joined with `velocity`, `goal` and others.
 
-    The image comes in scaled to 0..1, which stable-baselines3 does with uint8 images.
+    The image is `depth`, `rgb` or `grey` (n, channels, height, width). It comes in scaled
+    to 0..1, which stable-baselines3 does with uint8 images.
     """
 
     def __init__(self, observation_space: spaces.Dict, spec: NetworkSpec) -> None:
-        shape = observation_space[DEPTH].shape
+        self.image = image_key(observation_space.spaces)
+        shape = observation_space[self.image].shape
         assert shape is not None  # noqa: S101 (a Box has a shape)
         vectors = [key for key in VECTORS if key in observation_space.spaces]
-        vectors += [key for key in observation_space.spaces if key not in (DEPTH, *VECTORS)]
+        vectors += [key for key in observation_space.spaces if key not in (self.image, *VECTORS)]
         numbers = sum(spaces.flatdim(observation_space[key]) for key in vectors)
         super().__init__(observation_space, flat_size(spec, *shape[1:]) + numbers)
         self.vectors = vectors
@@ -98,10 +100,14 @@ class DepthExtractor(BaseFeaturesExtractor):
 
     def forward(self, observations: dict[str, torch.Tensor]) -> torch.Tensor:
         """Return the features (n, features_dim)."""
-        flat = self.convolutions(observations[DEPTH])
+        flat = self.convolutions(observations[self.image])
         # Under autocast the convolutions give bfloat16, the vectors are float32.
         vectors = [observations[key].to(flat.dtype) for key in self.vectors]
         return torch.cat([flat, *vectors], dim=1)
+
+
+DepthExtractor = ImageExtractor
+"""Its name in models that were saved before there was colour."""
 
 
 def policy_arguments(spec: NetworkSpec) -> dict[str, Any]:
@@ -118,7 +124,7 @@ def policy_arguments(spec: NetworkSpec) -> dict[str, Any]:
             "activation_fn": nn.ReLU,
         }
     return {
-        "features_extractor_class": DepthExtractor,
+        "features_extractor_class": ImageExtractor,
         "features_extractor_kwargs": {"spec": spec},
         "net_arch": dense_units(spec),
         "activation_fn": nn.ReLU,

@@ -21,7 +21,7 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.files import replace_file
 from airl_mav.policy.card import ONNX_FILE, TORCH_FILE, PolicyCard, PolicyFacts, digest
 from airl_mav.policy.card_writing import write_card
-from airl_mav.policy.layouts import DEPTH, Encoded, ObservationSpec, boxes
+from airl_mav.policy.layouts import Encoded, ObservationSpec, boxes
 from airl_mav.policy.runtime import (
     ACTION,
     NEXT,
@@ -92,10 +92,10 @@ def export_network(
 ) -> PolicyCard:
     """Write a network as `export.export_sb3` does a model, and return its card.
 
-    The network takes `depth` (n, 1, h, w) uint8, `velocity` and `goal` (n, 3) float32; it returns a
-    score for each discrete action (n, k), or the continuous action (n, 2). Scaling the image is its
-    own business. One with a memory has it as further inputs and outputs, and their shapes in its
-    attribute `state` (`recurrent.RecurrentNetwork`).
+    The network takes the image (`depth`, `rgb` or `grey`; (n, channels, h, w) uint8), `velocity`
+    and `goal` (n, 3) float32; it returns a score for each discrete action (n, k), or the continuous
+    action (n, 2). Scaling the image is its own business. One with a memory has it as further inputs
+    and outputs, and their shapes in its attribute `state` (`recurrent.RecurrentNetwork`).
 
     Nothing is written unless ONNX Runtime gives what torch gives. A kill on the way leaves a policy
     without a card, or an old card that refuses the new policy: never a card for the wrong one.
@@ -145,7 +145,7 @@ def random_inputs(spec: ObservationSpec, n: int, rng: np.random.Generator) -> En
     """Return arrays of a layout with n rows of noise."""
     return {
         key: rng.integers(0, 256, (n, *box.shape), np.uint8)
-        if key == DEPTH
+        if np.dtype(box.dtype) == np.uint8
         else rng.normal(0.0, 2.0, (n, *box.shape)).astype(np.float32)
         for key, box in boxes(spec).items()
     }

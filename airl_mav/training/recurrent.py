@@ -15,7 +15,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from torch import nn
 from torch.nn import functional
 
-from airl_mav.policy.layouts import DEPTH, GOAL, VELOCITY, Encoded
+from airl_mav.policy.layouts import GOAL, VELOCITY, Encoded
 from airl_mav.policy.runtime import Shapes
 
 HIDDEN, CELL = "hidden", "cell"
@@ -48,9 +48,15 @@ class LstmStep(nn.Module):
 class RecurrentNetwork(nn.Module):
     """From the three inputs, hidden and cell to the outputs, the next hidden and the next cell."""
 
-    def __init__(self, features: nn.Module, lstm: nn.LSTM, head: nn.Module) -> None:
-        """Take the way from a Dict of observations to features, and from the LSTM to outputs."""
+    def __init__(
+        self, features: nn.Module, lstm: nn.LSTM, head: nn.Module, image: str = "depth"
+    ) -> None:
+        """Take the way from a Dict of observations to features, and from the LSTM to outputs.
+
+        `image` is the key of the image.
+        """
         super().__init__()
+        self.image = image
         self.features = features
         self.steps = nn.ModuleList(LstmStep(lstm, layer) for layer in range(lstm.num_layers))
         self.head = head
@@ -61,14 +67,14 @@ class RecurrentNetwork(nn.Module):
 
     def forward(
         self,
-        depth: torch.Tensor,
+        image: torch.Tensor,
         velocity: torch.Tensor,
         goal: torch.Tensor,
         hidden: torch.Tensor,
         cell: torch.Tensor,
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Return the outputs (n, k), and hidden and cell (n, layers, units) after the decision."""
-        found = self.features({DEPTH: depth, VELOCITY: velocity, GOAL: goal})
+        found = self.features({self.image: image, VELOCITY: velocity, GOAL: goal})
         hiddens, cells = [], []
         for layer, step in enumerate(self.steps):
             found, kept = step(found, hidden[:, layer], cell[:, layer])
@@ -94,7 +100,7 @@ class GreedyDecisions:
 
     def __call__(self, seen: Encoded) -> NDArray[Any]:
         """Return the actions of n vehicles."""
-        starts = np.zeros(len(seen[DEPTH]), np.bool_)
+        starts = np.zeros(len(next(iter(seen.values()))), np.bool_)
         starts[list(self._new)] = True
         self._new.clear()
         actions, self._state = self._model.predict(

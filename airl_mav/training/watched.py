@@ -24,7 +24,7 @@ from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.envs.trace import Trace
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.policy.action_sets import commands, discrete_actions
-from airl_mav.policy.layouts import DEPTH
+from airl_mav.policy.layouts import Encoded, newest_frame
 from airl_mav.training.store import Evaluation, TrainingProgress
 from airl_mav.view.ends import ViewEnds
 from airl_mav.view.feed import Feed
@@ -32,9 +32,9 @@ from airl_mav.view.handshake import Request
 from airl_mav.view.messages import (
     ArenaShown,
     Decided,
-    Depth,
     Episode,
     Flight,
+    Image,
     Message,
     Phase,
     Picture,
@@ -42,6 +42,7 @@ from airl_mav.view.messages import (
     Trained,
     Vehicle,
     VehicleShape,
+    shape_of,
 )
 from airl_mav.view.pace import Pace
 from airl_mav.view.shown import OFFBOARD
@@ -97,7 +98,7 @@ class Moment(NamedTuple):
 
     time_us: int
     message: Message
-    image: Depth | None = None
+    image: Image | None = None
 
 
 class _Standing(NamedTuple):
@@ -240,7 +241,7 @@ class Reflight:
         yield self._picture(began_us)
         seen, shown, decisions = navigation.observe(), 0, len(taped.actions)
         for k in range(decisions):
-            image = self._as_seen(seen[DEPTH][0, 0])
+            image = self._as_seen({key: array[0] for key, array in seen.items()})
             chosen = commands(self._environment.action_spec, taped.actions[k][None])
             navigation.fly(chosen)
             yield self._decided(image, began_us)
@@ -286,18 +287,24 @@ class Reflight:
 
     def _picture(self, began_us: int) -> Moment:
         image = self.navigation.cameras.image[0].copy()
-        height, width = image.shape
         now_us = self._now_us()
-        return Moment(now_us, Picture(captured_us=began_us + now_us, shape=(height, width)), image)
+        return Moment(now_us, Picture(captured_us=began_us + now_us, shape=shape_of(image)), image)
 
-    def _as_seen(self, image: NDArray[np.uint8]) -> Depth:
-        """Return the network's image as depths [mm] that the view shows as the network has them."""
+    def _as_seen(self, seen: Encoded) -> Image:
+        """Return the network's image that the view shows as the network has it.
+
+        Of depth those are depths [mm]; colours are what they are.
+        """
+        spec = self.navigation.observation
+        image = newest_frame(spec, seen)
+        if spec.kind != "depth":
+            return image if image.ndim == 3 else image[..., None]
         far_mm = self.navigation.observation.range_m * MM_PER_M
         # 0 would be what no depth is known of.
-        depth: Depth = np.maximum(np.rint(image * (far_mm / 255.0)), 1.0).astype(np.uint16)
+        depth: Image = np.maximum(np.rint(image * (far_mm / 255.0)), 1.0).astype(np.uint16)
         return depth
 
-    def _decided(self, image: Depth, began_us: int) -> Moment:
+    def _decided(self, image: Image, began_us: int) -> Moment:
         """Return the newest decision, at the time at which it began."""
         record = self._trace.latency(0)
         stamp = {name: int(column[-1]) for name, column in record.items() if column.ndim == 1}
@@ -311,7 +318,6 @@ class Reflight:
             held_s = episode.hold_s + episode.hover_after_s
             expires_us = began_us + sent + round(held_s * US_PER_S)
         forward, right, down, turn = record["setpoint"][-1].astype(float).tolist()
-        height, width = image.shape
         message = Decided(
             captured_us=began_us + stamp["capture_us"],
             began_us=began_us + began,
@@ -320,7 +326,7 @@ class Reflight:
             expires_us=expires_us,
             setpoint=(forward, right, down, turn),
             compensated=self._environment.compensate,
-            shape=(height, width),
+            shape=shape_of(image),
         )
         return Moment(began, message, image)
 

@@ -65,7 +65,8 @@ class Controls:
         """Add what sets the latency.
 
         Args:
-            compensable: Whether it can be compensated: the vehicle's response is known.
+            compensable: Whether it can be compensated: the vehicle's response is known, and its
+                camera gives depth.
             compensated: Whether it is, as the scenario says.
         """
         gui = self._gui

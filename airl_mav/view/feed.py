@@ -15,7 +15,7 @@ from airl_mav.core.clock import Clock, WallClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.ports import LOOPBACK
 from airl_mav.view.ends import ViewEnds
-from airl_mav.view.messages import Depth, Message, Steering, Told, from_parts, to_parts
+from airl_mav.view.messages import Image, Message, Steering, Told, from_parts, to_parts
 
 QUEUED = 64
 """Messages that wait for a view at most, on either side; more are dropped."""
@@ -35,10 +35,10 @@ class Feed:
         self._socket.setsockopt(zmq.LINGER, 0)
         self._socket.connect(ends.told)
 
-    def send(self, message: Message, depth_mm: Depth | None = None) -> None:
-        """Send a message with its image (h, w), or drop it."""
+    def send(self, message: Message, image: Image | None = None) -> None:
+        """Send a message with its image, or drop it."""
         with suppress(zmq.Again):
-            self._socket.send_multipart(to_parts(message, depth_mm), zmq.NOBLOCK)
+            self._socket.send_multipart(to_parts(message, image), zmq.NOBLOCK)
 
     def close(self) -> None:
         """Disconnect; what is still on its way is dropped."""
@@ -101,9 +101,9 @@ class Ends:
         socket.bind(f"tcp://{LOOPBACK}:*")
         return socket
 
-    def take(self, wait_s: float) -> list[tuple[Told, Depth | None]]:
+    def take(self, wait_s: float) -> list[tuple[Told, Image | None]]:
         """Return all that has come, oldest first; if it is nothing, after waiting for so long."""
-        found: list[tuple[Told, Depth | None]] = []
+        found: list[tuple[Told, Image | None]] = []
         wait_ms = round(1e3 * wait_s)
         while self._told.poll(wait_ms):
             read = from_parts(self._told.recv_multipart())

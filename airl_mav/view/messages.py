@@ -1,12 +1,13 @@
 """What a flight tells its view: small snapshots of pure data, and their bytes on the wire.
 
 Positions and velocities are local NED [m, m/s], attitudes body FRD -> NED [w, x, y, z], times
-simulated [µs]. A message is one part of JSON; an image follows as a second part, little-endian
-uint16 millimetres.
+simulated [µs]. A message is one part of JSON; an image follows as a second part: little-endian
+uint16 millimetres of depth, or bytes of colour.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -20,7 +21,10 @@ from airl_mav.profiles.vehicle import Momentum, VehicleProfile
 
 Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
-Depth = NDArray[np.uint16]
+Image = NDArray[Any]
+"""As `camera.frame.Frame.image`: depth (h, w) uint16 [mm], colour (h, w, channels) uint8."""
+
+Shape = tuple[int, int] | tuple[int, int, int]
 
 ROTOR_SHARE = 0.8
 """Radius of a rotor as a share of half the distance to its neighbour, where the profile does not
@@ -174,8 +178,8 @@ class Picture(Message):
 
     kind: Literal["picture"] = "picture"
     captured_us: int
-    shape: tuple[int, int]
-    """Height and width [px]."""
+    shape: Shape
+    """Height and width [px]; of colour the channels, too."""
 
 
 class Decided(Message):
@@ -193,8 +197,8 @@ class Decided(Message):
     """Velocity forward, right, down [m/s] in the heading frame, yaw rate [rad/s]."""
     compensated: bool
     """Whether the policy saw what was expected, not what was."""
-    shape: tuple[int, int]
-    """Height and width of the image [px]."""
+    shape: Shape
+    """Height and width of the image [px]; of colour the channels, too."""
 
 
 class Flight(Message):
@@ -264,26 +268,37 @@ class Steering(Message):
     """Whether it is compensated; None: as the scenario says."""
 
 
-def to_parts(message: Message, depth_mm: Depth | None = None) -> list[bytes]:
-    """Return the parts of a message; `depth_mm` (h, w) is its image."""
+def to_parts(message: Message, image: Image | None = None) -> list[bytes]:
+    """Return the parts of a message; `image` is its image."""
     parts = [message.model_dump_json().encode()]
-    if depth_mm is not None:
-        parts.append(np.ascontiguousarray(depth_mm, "<u2").tobytes())
+    if image is not None:
+        parts.append(np.ascontiguousarray(image, _number(image.shape)).tobytes())
     return parts
 
 
-def from_parts(parts: list[bytes]) -> tuple[Told, Depth | None] | None:
-    """Return a message and its image (h, w) [mm]; None for what is no message."""
+def from_parts(parts: list[bytes]) -> tuple[Told, Image | None] | None:
+    """Return a message and its image; None for what is no message."""
     try:
         message = _TOLD.validate_json(parts[0])
     except (ValidationError, IndexError):
         return None
     if not isinstance(message, Picture | Decided):
         return message, None
-    height, width = message.shape
-    if len(parts) != 2 or min(height, width) < 1 or len(parts[1]) != 2 * height * width:
+    shape, number = message.shape, np.dtype(_number(message.shape))
+    if len(parts) != 2 or min(shape) < 1 or len(parts[1]) != number.itemsize * math.prod(shape):
         return None
-    return message, np.frombuffer(parts[1], "<u2").reshape(height, width)
+    return message, np.frombuffer(parts[1], number).reshape(shape)
+
+
+def shape_of(image: Image) -> Shape:
+    """Return the shape of an image as a message tells it."""
+    height, width, *channels = image.shape
+    return (height, width, channels[0]) if channels else (height, width)
+
+
+def _number(shape: tuple[int, ...]) -> str:
+    """Return the type of an image's numbers."""
+    return "<u2" if len(shape) == 2 else "u1"
 
 
 def _row(array: NDArray[np.float64]) -> Any:

@@ -9,7 +9,7 @@ import numpy as np
 import viser
 from viser import uplot
 
-from airl_mav.view.pictures import depth_picture, numbers_html, texts_html, title_html
+from airl_mav.view.pictures import camera_picture, numbers_html, texts_html, title_html
 from airl_mav.view.shown import STRIP_S, Shown
 
 AGE_COLOUR, T2_COLOUR = "#2868a8", "#b4540a"
@@ -74,11 +74,11 @@ class Panel:
                 element.content = text
         if shown.decisions != self._decisions:
             self._decisions = shown.decisions
-            if shown.episode is None or shown.decided_mm is None:
+            if shown.episode is None or shown.decided_image is None:
                 self._picture.image = BLANK
             else:
                 range_m = shown.episode.vehicle.camera_range_m
-                self._picture.image = depth_picture(shown.decided_mm, range_m)
+                self._picture.image = camera_picture(shown.decided_image, range_m)
 
     def draw_strip(self, shown: Shown) -> None:
         """Show the latencies of the last seconds."""

@@ -1,4 +1,4 @@
-"""What the panel shows, as pure functions: depth images in colour, numbers and texts as HTML."""
+"""What the panel shows, as pure functions: the camera's images, numbers and texts as HTML."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.camera.frame import MM_PER_M
+from airl_mav.camera.frame import MM_PER_M, rgb_of
 from airl_mav.core.constants import US_PER_S
-from airl_mav.view.messages import Depth
+from airl_mav.view.messages import Image
 from airl_mav.view.shown import Shown
 
 NO_RETURN = (38, 42, 48)
@@ -27,17 +27,20 @@ WARNING = 4
 NOTHING = "–"
 
 
-def depth_picture(depth_mm: Depth, range_m: float) -> NDArray[np.uint8]:
-    """Return a depth image in colour, RGB (h, w, 3): near is bright.
+def camera_picture(image: Image, range_m: float) -> NDArray[np.uint8]:
+    """Return a camera's image for people, RGB (h, w, 3): of depth near is bright.
 
     Args:
-        depth_mm: (h, w) along the optical axis [mm]; 0 = no return.
+        image: As `camera.frame.Frame.image`.
         range_m: Farthest depth that the camera returns [m].
     """
-    # By the square root, which shows near things best.
-    share = np.sqrt(np.clip(depth_mm / (MM_PER_M * range_m), 0.0, 1.0))
-    picture = _colours()[(255.0 * (1.0 - share)).astype(np.uint8)]
-    picture[depth_mm == 0] = NO_RETURN
+    if image.ndim == 3:
+        picture = rgb_of(image)
+    else:
+        # By the square root, which shows near things best.
+        share = np.sqrt(np.clip(image / (MM_PER_M * range_m), 0.0, 1.0))
+        picture = _colours()[(255.0 * (1.0 - share)).astype(np.uint8)]
+        picture[image == 0] = NO_RETURN
     times = max(1, math.ceil(LEAST_PX / picture.shape[1]))
     larger: NDArray[np.uint8] = np.kron(picture, np.ones((times, times, 1), np.uint8))
     return larger

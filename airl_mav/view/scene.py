@@ -43,7 +43,7 @@ from airl_mav.view.look import (
     Look,
 )
 from airl_mav.view.messages import Episode, Vehicle, VehicleShape
-from airl_mav.view.pictures import depth_picture
+from airl_mav.view.pictures import camera_picture
 from airl_mav.view.shown import Shown
 
 FRUSTUM_M = 0.6
@@ -109,9 +109,9 @@ class FlightScene:
                 self._build(episode, shown.arena)
             if shown.vehicle is not None:
                 self._move(shown, shown.vehicle, episode)
-        if picture and shown.picture_mm is not None and self._look.whole:
+        if picture and shown.picture is not None and self._look.whole:
             range_m = episode.vehicle.camera_range_m
-            self._camera.image = depth_picture(shown.picture_mm, range_m)
+            self._camera.image = camera_picture(shown.picture, range_m)
 
     # --- once an episode
 

@@ -13,9 +13,9 @@ from airl_mav.arena.geometry import Arena
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.view.messages import (
     Decided,
-    Depth,
     Episode,
     Flight,
+    Image,
     Phase,
     Picture,
     Said,
@@ -53,10 +53,10 @@ class Shown:
     vehicle: Vehicle | None = None
     trail: list[Point] = field(default_factory=list)
     """Where the vehicle was in this episode, NED [m]."""
-    picture_mm: Depth | None = None
+    picture: Image | None = None
     """The camera's newest image."""
     decided: Decided | None = None
-    decided_mm: Depth | None = None
+    decided_image: Image | None = None
     """What the policy saw at that decision."""
     trained: Trained | None = None
     """What a training's newest decision came to; None: nothing is trained."""
@@ -65,14 +65,14 @@ class Shown:
     ages: deque[tuple[float, float, float]] = field(default_factory=deque)
     """Time since the episode began [s], age of the command and t2 of its decision [ms]."""
 
-    def take(self, message: Told, depth_mm: Depth | None) -> None:
-        """Take in a message, with its image (h, w) [mm]."""
+    def take(self, message: Told, image: Image | None) -> None:
+        """Take in a message, with its image."""
         if isinstance(message, Vehicle):
             self._move(message)
         elif isinstance(message, Picture):
-            self.picture_mm = depth_mm
+            self.picture = image
         elif isinstance(message, Decided):
-            self.decided, self.decided_mm = message, depth_mm
+            self.decided, self.decided_image = message, image
             self.decisions += 1
         elif isinstance(message, Episode):
             self._begin(message)
@@ -89,7 +89,7 @@ class Shown:
         self.episode = episode
         self.arena = None if episode.arena is None else episode.arena.arena()
         self.episodes += 1
-        self.vehicle = self.picture_mm = self.decided = self.decided_mm = None
+        self.vehicle = self.picture = self.decided = self.decided_image = None
         self.trail, self.decisions = [], 0
         self.ages.clear()
 

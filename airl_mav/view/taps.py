@@ -18,6 +18,7 @@ from airl_mav.view.messages import (
     Steering,
     Vehicle,
     VehicleShape,
+    shape_of,
 )
 from companion.pilot import Decided as Decision
 from firmware_sim.autopilot.commander import Phase
@@ -82,9 +83,8 @@ class SimulationTap:
         if due == self._picture_due:
             return
         self._picture_due = due
-        height, width = frame.depth_mm.shape
-        shown = Picture(captured_us=frame.capture_time_us, shape=(height, width))
-        self._feed.send(shown, frame.depth_mm)
+        shown = Picture(captured_us=frame.capture_time_us, shape=shape_of(frame.image))
+        self._feed.send(shown, frame.image)
 
     def close(self) -> None:
         """Disconnect."""
@@ -121,14 +121,13 @@ class CompanionTap:
         return HandLatency(self._hand, sampler)
 
     def compensator(self) -> Compensator | None:
-        """Return one that the watchers may switch; None: the vehicle's response is not known."""
-        if self._scenario.vehicle.response is None:
+        """Return one that the watchers may switch; None: nothing can be carried forward."""
+        if not self._scenario.vehicle.compensable:
             return None
         return HandCompensator(self._hand, self._scenario)
 
     def decided(self, decision: Decision) -> None:
         """A decision was sent."""
-        height, width = decision.depth_mm.shape
         forward, right, down, turn = (float(number) for number in decision.setpoint)
         shown = Decided(
             captured_us=decision.seen.frame.capture_time_us,
@@ -137,10 +136,10 @@ class CompanionTap:
             sent_us=decision.sent_us,
             expires_us=decision.expires_us,
             setpoint=(forward, right, down, turn),
-            compensated=self._scenario.vehicle.response is not None and self._hand.compensates(),
-            shape=(height, width),
+            compensated=self._scenario.vehicle.compensable and self._hand.compensates(),
+            shape=shape_of(decision.image),
         )
-        self._feed.send(shown, decision.depth_mm)
+        self._feed.send(shown, decision.image)
 
     def close(self) -> None:
         """Disconnect."""

@@ -33,7 +33,7 @@ def request_of(scenario: ResolvedScenario, name: str, port: int | None = None) -
         paced=paced,
         speed=(scenario.speed or REAL_TIME) if paced else None,
         steerable=True,
-        compensable=scenario.vehicle.response is not None,
+        compensable=scenario.vehicle.compensable,
         compensated=scenario.pilot.compensate,
     )
 

@@ -54,8 +54,8 @@ def open_named_camera(name: str, clock: Clock, wanted: Intrinsics, whose: str) -
         whose: Whose camera `wanted` is: "vehicle quad".
 
     Raises:
-        FieldError: There is no such camera, it sees too little of what is wanted, or it is no
-            cylinder where one is wanted.
+        FieldError: There is no such camera, it sees too little of what is wanted, or it gives
+            depth of a pinhole where a cylinder or colour is wanted.
     """
     if "://" in name:
         return open_camera(name, clock)
@@ -64,6 +64,13 @@ def open_named_camera(name: str, clock: Clock, wanted: Intrinsics, whose: str) -
             "camera",
             name,
             problem=f"drivers give images of a pinhole, the camera of {whose} is cylindrical;"
+            " accepted: tcp://HOST:PORT or ipc://PATH of a publisher of such images",
+        )
+    if wanted.kind != "depth":
+        raise FieldError(
+            "camera",
+            name,
+            problem=f"drivers give depth images, the camera of {whose} is of kind {wanted.kind!r};"
             " accepted: tcp://HOST:PORT or ipc://PATH of a publisher of such images",
         )
     camera = _driver(name, clock)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.errors import FieldError
-from airl_mav.policy.layouts import nearest_returns
+from airl_mav.policy.images import nearest_returns
 
 MOST_POINTS = 16
 """Points looked up along each side of a pixel, at most."""

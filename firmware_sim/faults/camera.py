@@ -1,12 +1,12 @@
-"""A depth camera that fails: no frames, always the same picture, noise, frames that come late."""
+"""A camera that fails: no frames, always the same picture, noise, frames that come late."""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.camera.frame import Frame
@@ -16,19 +16,19 @@ from airl_mav.core.frames import Vector
 from airl_mav.faults.kinds import NOISE_SEED
 from airl_mav.profiles.conditions import SensorNoise
 from firmware_sim.faults.timeline import Acting, FaultTimeline
-from firmware_sim.plant.camera_server import DepthCamera
+from firmware_sim.plant.camera_server import SimulatedCamera
 
 
 class FailingCamera:
     """A camera as the simulation asks for its frames: there only where faults are asked for."""
 
-    def __init__(self, camera: DepthCamera, timeline: FaultTimeline, seed: int) -> None:
+    def __init__(self, camera: SimulatedCamera, timeline: FaultTimeline, seed: int) -> None:
         """Take the healthy camera, the faults of the episode, and its seed."""
         self._camera = camera
         self._timeline = timeline
         self._seed = seed
         self._acting: list[Acting] = []
-        self._frozen: NDArray[np.uint16] | None = None
+        self._frozen: NDArray[Any] | None = None
         self._late: deque[tuple[int, Frame]] = deque()
         timeline.on_change(self._rearrange)
 
@@ -50,7 +50,7 @@ class FailingCamera:
         quaternion: Vector,
         publish: Callable[[Frame], None],
     ) -> None:
-        """Hand the frames that are due to `publish`; see `DepthCamera.offer`."""
+        """Hand the frames that are due to `publish`; see `SimulatedCamera.offer`."""
         if time_us >= self._camera.next_us:
             self._camera.offer(
                 time_us, position, quaternion, lambda frame: self._take(frame, publish)
@@ -70,11 +70,11 @@ class FailingCamera:
                 noise = DepthNoise(None, SensorNoise(depth_noise=each.fault.amount))
                 seed = NOISE_SEED * (each.number + 1) + self._seed
                 depth = noisy_frame(frame.depth_mm, noise, seed, frame.sequence)
-                frame = replace(frame, depth_mm=depth)
+                frame = replace(frame, image=depth)
             else:  # stuck
                 if self._frozen is None:
-                    self._frozen = frame.depth_mm
-                frame = replace(frame, depth_mm=self._frozen)
+                    self._frozen = frame.image
+                frame = replace(frame, image=self._frozen)
         if delay_us or self._late:
             # A frame that was taken later must not overtake: a camera's frames come in order.
             due_us = frame.capture_time_us + delay_us

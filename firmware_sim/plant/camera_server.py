@@ -1,19 +1,21 @@
-"""The vehicle's depth camera: its schedule, its images, and their publication."""
+"""The vehicle's camera: its schedule, its images, and their publication."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import zmq
 from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena
-from airl_mav.camera.frame import Frame, depth_to_z16
+from airl_mav.camera.exposure import expose
+from airl_mav.camera.frame import Frame
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.noise import noise_of, noisy_frame
-from airl_mav.camera.render import Mount, camera_pose, render
+from airl_mav.camera.render import Mount, camera_pose
 from airl_mav.core.constants import DEG
 from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import Vector
@@ -22,7 +24,7 @@ from airl_mav.profiles.vehicle import Camera
 from firmware_sim.plant.sensors import Rate
 
 
-class DepthCamera:
+class SimulatedCamera:
     """Takes frames of an arena at a fixed rate, from a vehicle's pose."""
 
     def __init__(
@@ -84,17 +86,17 @@ class DepthCamera:
         elapsed_us = time_us - self._start_us
         self._rate.due(elapsed_us)
         self.next_us = self._start_us + math.ceil(self._rate.next_us)
-        depth = depth_to_z16(self._look(elapsed_us, position, quaternion))
+        image = self._look(elapsed_us, position, quaternion)
         if self._noise is not None:
-            depth = noisy_frame(depth, self._noise, self._seed, self._rate.period)
-        frame = Frame(self._sequence, time_us, depth, self._intrinsics)
+            image = noisy_frame(image, self._noise, self._seed, self._rate.period)
+        frame = Frame(self._sequence, time_us, image, self._intrinsics)
         self._sequence += 1
         return frame
 
-    def _look(self, elapsed_us: int, position: Vector, quaternion: Vector) -> NDArray[np.float32]:
+    def _look(self, elapsed_us: int, position: Vector, quaternion: Vector) -> NDArray[Any]:
         at, attitude = camera_pose(position, quaternion, self._mount)
         centers = self._arena.centers_at(elapsed_us)
-        return render(self._arena, centers, self._intrinsics, self._max_range, at, attitude)
+        return expose(self._arena, centers, self._intrinsics, self._max_range, at, attitude)
 
 
 class CameraServer:

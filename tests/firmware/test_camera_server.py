@@ -12,17 +12,20 @@ from typing import Any, cast
 import numpy as np
 import pytest
 import zmq
+from PIL import Image
 
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape, Tour
 from airl_mav.camera.frame import MOST_BYTES, Frame
 from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.picture import render_picture
 from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import quat_from_euler
+from airl_mav.profiles.camera_kind import CameraKind
 from airl_mav.profiles.vehicle import load_vehicle
 from companion.camera import MESSAGES_PER_LOOK, ZmqFrameSource
-from firmware_sim.plant.camera_server import CameraServer, DepthCamera
+from firmware_sim.plant.camera_server import CameraServer, SimulatedCamera
 from tests.support.flight_rig import quad
 
 LENS = Intrinsics.from_fov(33, 25, math.pi / 2)
@@ -44,14 +47,14 @@ def room(half: float = 20.0, *, pillar_at: float | None = None) -> Arena:
 
 def camera(
     rate_hz: float = 30.0, arena: Arena | None = None, *, start_us: int = 0, **mount: float
-) -> DepthCamera:
+) -> SimulatedCamera:
     lens = {"width_px": 33, "height_px": 25, "horizontal_fov_deg": 90.0, "range_m": 60.0}
     level = {"forward_m": 0.0, "up_m": 0.0, "pitch_up_deg": 0.0}
     profile = quad(camera={**lens, **level, **mount, "rate_hz": rate_hz}).camera
-    return DepthCamera(profile, arena or room(), start_us)
+    return SimulatedCamera(profile, arena or room(), start_us)
 
 
-def take(cam: DepthCamera, time_us: int = 0, yaw: float = 0.0) -> Frame:
+def take(cam: SimulatedCamera, time_us: int = 0, yaw: float = 0.0) -> Frame:
     return cam.capture(time_us, np.array([0.0, 0, -2]), quat_from_euler(0, 0, yaw))
 
 
@@ -159,7 +162,7 @@ def test_frame_arrives_whole(transport: str, tmp_path: Path) -> None:
 def test_a_panorama_arrives_whole() -> None:
     """Through ZeroMQ: the image of all sides, and that it is one."""
     profile = load_vehicle("quad-panorama").camera
-    sent = take(DepthCamera(profile, room(12.0, pillar_at=-6.0)), yaw=0.4)
+    sent = take(SimulatedCamera(profile, room(12.0, pillar_at=-6.0)), yaw=0.4)
     server = CameraServer(LOOPBACK)
     source = ZmqFrameSource(server.endpoint, SimClock())
     try:
@@ -173,6 +176,32 @@ def test_a_panorama_arrives_whole() -> None:
         np.testing.assert_array_equal(received.frame.depth_mm, sent.depth_mm)
         assert np.all(sent.depth_mm[19] > 0)  # walls all round, and the pillar behind
         assert 4_990 <= int(sent.depth_mm[19].min()) <= 5_020
+    finally:
+        source.close()
+        server.close()
+
+
+@pytest.mark.parametrize("kind", ["rgb", "grey"])
+def test_colours_arrive_whole(kind: CameraKind) -> None:
+    """Through ZeroMQ: as the ray caster draws them, and what they are."""
+    profile = load_vehicle("quad").camera.model_copy(update={"kind": kind})
+    scene = room(12.0, pillar_at=6.0)
+    sent = take(SimulatedCamera(profile, scene))
+    server = CameraServer(LOOPBACK)
+    source = ZmqFrameSource(server.endpoint, SimClock())
+    try:
+        received = None
+        for _ in range(1000):
+            server.publish(sent)
+            if (received := source.wait(-1, 0.02)) is not None:
+                break
+        assert received is not None
+        assert received.frame.intrinsics == sent.intrinsics == Intrinsics.of(profile)
+        np.testing.assert_array_equal(received.frame.image, sent.image)
+        where, level = (profile.forward_m, 0.0, -2.0 - profile.up_m), (1.0, 0.0, 0.0, 0.0)
+        rgb = render_picture(scene, scene.centers_at(0), sent.intrinsics, where, level).rgb
+        wanted = rgb if kind == "rgb" else np.array(Image.fromarray(rgb).convert("L"))[..., None]
+        np.testing.assert_array_equal(sent.image, wanted)
     finally:
         source.close()
         server.close()

@@ -20,7 +20,7 @@ from airl_mav.lockstep.flight import fly
 from airl_mav.policy.actions import Action
 from airl_mav.policy.greedy import GreedyPolicy
 from airl_mav.policy.observation import Observation
-from firmware_sim.plant.camera_server import DepthCamera
+from firmware_sim.plant.camera_server import SimulatedCamera
 from tests.support.lockstep_kit import demo_scenario
 
 SEED = 3
@@ -41,15 +41,15 @@ def test_the_companion_gets_the_images_that_the_twin_renders(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     poses: dict[int, tuple[np.ndarray, np.ndarray]] = {}
-    real = DepthCamera.capture
+    real = SimulatedCamera.capture
 
     def capture(
-        self: DepthCamera, time_us: int, position: np.ndarray, quaternion: np.ndarray
+        self: SimulatedCamera, time_us: int, position: np.ndarray, quaternion: np.ndarray
     ) -> Frame:
         poses[time_us] = np.array(position), np.array(quaternion)
         return real(self, time_us, position, quaternion)
 
-    monkeypatch.setattr(DepthCamera, "capture", capture)
+    monkeypatch.setattr(SimulatedCamera, "capture", capture)
     scenario = demo_scenario(
         vehicle="quad-panorama", arena="dynamic-obstacles", policy="greedy", time_limit_s=20.0
     )

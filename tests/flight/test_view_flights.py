@@ -86,8 +86,8 @@ def test_a_watched_flight_is_the_same_bit_by_bit() -> None:
     assert shown.to_goal_m is not None
     assert shown.to_goal_m < 3.5
     assert len(shown.trail) > 100
-    assert shown.decided_mm is not None
-    assert shown.decided_mm.shape == (48, 64)
+    assert shown.decided_image is not None
+    assert shown.decided_image.shape == (48, 64)
 
 
 def test_a_latency_by_hand_acts_and_is_on_record() -> None:

@@ -32,7 +32,7 @@ from airl_mav.vehicle.wind import BLOCK, wind_of_episode
 from firmware_sim.interfaces import BatterySample
 from firmware_sim.plant.bullet import pybullet
 from firmware_sim.plant.bullet_body import BulletBody
-from firmware_sim.plant.camera_server import DepthCamera
+from firmware_sim.plant.camera_server import SimulatedCamera
 from firmware_sim.plant.sensors import SensorSuite
 from firmware_sim.simulation import EpisodeSetup, Simulation
 from tests.learning.test_fleet import ENDLESS, OPEN, QUAD, VEHICLE, PlantPilot, command
@@ -221,7 +221,7 @@ def test_the_plant_s_camera_has_the_twin_s_pixels() -> None:
     pose = twin.truth()
     arena = twin.arenas[0]
     assert arena is not None
-    camera = DepthCamera(twin.camera, arena, 0, noise, seed)
+    camera = SimulatedCamera(twin.camera, arena, 0, noise, seed)
     frames: list[np.ndarray] = []
     while len(frames) < 80:
         at_us = math.ceil(camera.next_us / TICK_US) * TICK_US

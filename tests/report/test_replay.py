@@ -73,8 +73,8 @@ def test_a_moment_is_shown_as_it_was_recorded(flight: ReplayedFlight, seconds: f
     assert shown.ages
     assert shown.ages[-1][1] == pytest.approx(age_ms, abs=41.0)
     # The camera sees the arena: what it shows is not blank.
-    assert shown.decided_mm is not None
-    assert len(np.unique(shown.decided_mm)) > 20
+    assert shown.decided_image is not None
+    assert len(np.unique(shown.decided_image)) > 20
 
 
 def test_scrubbing_back_shows_the_earlier_decision(flight: ReplayedFlight) -> None:
@@ -110,7 +110,7 @@ def test_a_flight_outside_of_all_arenas_has_its_goal(flight: ReplayedFlight) -> 
         outside.show(shown, 12.0)
         scene.draw(shown, picture=True)
         assert shown.decided is not None
-        assert shown.decided_mm is None
+        assert shown.decided_image is None
         assert server.scene.get_handle_by_name("/flight/arena/walls") is None
         north, east, _ = server.scene.get_handle_by_name("/flight/goal/disc").position
         assert (north, east) == pytest.approx(flight.record.goal)

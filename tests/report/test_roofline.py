@@ -23,7 +23,6 @@ from airl_mav.envs.noticing import noticed_m
 from airl_mav.envs.roofline import Roofline, RooflinePoint
 from airl_mav.experiments import roofline as experiment
 from airl_mav.policy.card import read_card
-from airl_mav.policy.layouts import DEPTH
 from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.profiles.loading import profiles_dir
 from airl_mav.profiles.vehicle import load_vehicle
@@ -164,7 +163,7 @@ class StopsBefore:
         self._byte = depth_m / CARD.observation.range_m * 255.0
 
     def infer(self, encoded: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
-        upper = encoded[DEPTH][:, 0, : CARD.observation.height_px // 2]  # no floor in it
+        upper = encoded["depth"][:, 0, : CARD.observation.height_px // 2]  # no floor in it
         near = upper.min(axis=(1, 2)) < self._byte
         scores = np.zeros((len(near), 25), np.float32)
         scores[np.arange(len(near)), np.where(near, 20, 22)] = 1.0

@@ -18,7 +18,7 @@ from torch import nn
 
 from airl_mav.policy.action_sets import ActionSpec, discrete_actions
 from airl_mav.policy.card import PolicyCard, PolicyFacts
-from airl_mav.policy.layouts import DEPTH, Encoded, ObservationSpec, boxes
+from airl_mav.policy.layouts import Encoded, ObservationSpec, boxes, image_key
 from airl_mav.training.config import NetworkSpec
 from airl_mav.training.export import export_sb3
 from airl_mav.training.networks import DepthExtractor, dense_units
@@ -53,7 +53,8 @@ class Eye(BaseFeaturesExtractor):
     """Two convolutions; velocity and goal join behind them."""
 
     def __init__(self, observation_space: spaces.Dict) -> None:
-        shape = observation_space[DEPTH].shape
+        self.image = image_key(observation_space.spaces)
+        shape = observation_space[self.image].shape
         assert shape is not None
         layers = nn.Sequential(
             *(nn.Conv2d(shape[0], 4, 3, stride=2), nn.ReLU()),
@@ -64,7 +65,7 @@ class Eye(BaseFeaturesExtractor):
         self.layers = layers
 
     def forward(self, seen: dict[str, torch.Tensor]) -> torch.Tensor:
-        flat = self.layers(seen[DEPTH]).flatten(1)
+        flat = self.layers(seen[self.image]).flatten(1)
         return torch.cat([flat, seen["velocity"], seen["goal"]], dim=1)
 
 

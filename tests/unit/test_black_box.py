@@ -26,8 +26,8 @@ from airl_mav.black_box.messages import (
     Status,
     Telemetry,
     Truth,
-    depth_image,
-    depth_of,
+    image_message,
+    image_of,
     text,
 )
 from airl_mav.black_box.reading import read_black_box
@@ -73,7 +73,7 @@ MESSAGES: list[Any] = [
         20.0,
         (1.0, 0.0, 0.0, 0.5),
     ),
-    depth_image(np.arange(48 * 64, dtype=np.uint16).reshape(48, 64), NOW_US),
+    image_message(np.arange(48 * 64, dtype=np.uint16).reshape(48, 64), NOW_US),
     Truth(15, (1.0, 2.0, -3.0), (0.1, 0.2, 0.3), QUATERNION, 250.0),
     Command(15, (1.0, 0.0, 0.0), 0.5),
     Latency(5, 1.0, 2.0, 3.0, 0.1, None, None, None, 500.0, None),
@@ -101,7 +101,7 @@ def test_what_was_written_is_read(whole: Path) -> None:
     read = [message for kind in TOPICS for message in box.messages[kind]]
     assert sorted(map(repr, read)) == sorted(map(repr, MESSAGES))
     (image,) = box.all_of(RawImage)
-    np.testing.assert_array_equal(depth_of(image), np.arange(48 * 64).reshape(48, 64))
+    np.testing.assert_array_equal(image_of(image), np.arange(48 * 64).reshape(48, 64))
 
 
 def test_any_reader_of_mcap_reads_it_and_finds_its_schemas(whole: Path) -> None:
@@ -233,7 +233,7 @@ def test_killed_at_any_moment_at_most_a_second_is_lost(k: int, tmp_path: Path) -
     assert decisions == told[: len(decisions)], "in order, none missing, none made up"
     assert told[-1] - decisions[-1] < US_PER_S
     images = box.all_of(RawImage)
-    assert images and depth_of(images[0])[0, 0] == 1
+    assert images and image_of(images[0])[0, 0] == 1
 
 
 FOXGLOVE_TYPES = {"boolean", "string", "number", "integer", "object", "array"}

@@ -310,3 +310,11 @@ def test_a_driver_is_refused_where_a_cylinder_is_wanted(tmp_path: Path) -> None:
             f"{tmp_path}/mine.py:Unplugged", SimClock(), wanted, "vehicle quad-panorama"
         )
     assert caught.value.field == "camera"
+
+
+def test_a_driver_is_refused_where_colour_is_wanted(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(OWN)
+    wanted = Intrinsics.of(load_vehicle("quad-rgb").camera)
+    told = "drivers give depth images, the camera of vehicle quad-rgb is of kind 'rgb'; accepted"
+    with pytest.raises(FieldError, match=told):
+        open_named_camera(f"{tmp_path}/mine.py:Unplugged", SimClock(), wanted, "vehicle quad-rgb")

@@ -13,7 +13,9 @@ from hypothesis.extra.numpy import arrays
 
 from airl_mav.camera.frame import LEAST_PX, MAX_MM, MOST_PX, Frame, FrameError, depth_to_z16
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.profiles.projection import PROJECTIONS
+from airl_mav.core.errors import UsageError
+from airl_mav.profiles.camera_kind import KINDS, CameraKind
+from airl_mav.profiles.projection import PROJECTIONS, Projection
 
 lengths = st.floats(-MOST_PX, MOST_PX)
 focals = st.floats(LEAST_PX, MOST_PX)
@@ -25,10 +27,11 @@ def frames(draw: st.DrawFn) -> Frame:
     projection, focal = draw(st.sampled_from(PROJECTIONS)), draw(focals)
     if projection == "cylindrical":
         focal = max(focal, width / (2.0 * math.pi))
-    k = Intrinsics(width, height, focal, draw(lengths), draw(lengths), projection)
-    depth = draw(arrays(np.uint16, (height, width)))
+    kind = draw(st.sampled_from(KINDS))
+    k = Intrinsics(width, height, focal, draw(lengths), draw(lengths), projection, kind)
+    image = draw(arrays(k.dtype, k.shape))
     sequence = draw(st.integers(0, 2**64 - 1))
-    return Frame(sequence, draw(st.integers(-(2**63), 2**63 - 1)), depth, k)
+    return Frame(sequence, draw(st.integers(-(2**63), 2**63 - 1)), image, k)
 
 
 @given(frames())
@@ -36,8 +39,8 @@ def test_round_trip(frame: Frame) -> None:
     back = Frame.from_bytes(frame.to_bytes())
     assert (back.sequence, back.capture_time_us) == (frame.sequence, frame.capture_time_us)
     assert back.intrinsics == frame.intrinsics
-    assert back.depth_mm.dtype == np.uint16
-    np.testing.assert_array_equal(back.depth_mm, frame.depth_mm)
+    assert (back.image.dtype, back.image.shape) == (frame.image.dtype, frame.intrinsics.shape)
+    np.testing.assert_array_equal(back.image, frame.image)
 
 
 def test_wire_layout() -> None:
@@ -58,6 +61,32 @@ def test_a_cylinder_says_so_in_its_first_bytes_and_is_laid_out_alike() -> None:
     assert wire[4:] == pinhole[4:]
     assert Frame.from_bytes(wire).intrinsics.projection == "cylindrical"
     assert Frame.from_bytes(pinhole).intrinsics.projection == "pinhole"
+
+
+@pytest.mark.parametrize(
+    ("kind", "projection", "magic", "channels"),
+    [
+        ("rgb", "pinhole", b"ARF1", 3),
+        ("rgb", "cylindrical", b"ARC1", 3),
+        ("grey", "pinhole", b"AGF1", 1),
+        ("grey", "cylindrical", b"AGC1", 1),
+    ],
+)
+def test_colours_go_out_pixel_by_pixel_under_their_own_magic(
+    kind: CameraKind, projection: Projection, magic: bytes, channels: int
+) -> None:
+    image = np.arange(6 * channels, dtype=np.uint8).reshape(2, 3, channels)
+    lens = Intrinsics(3, 2, 1.5, 1.0, 0.5, projection, kind)
+    wire = Frame(7, 123_456, image, lens).to_bytes()
+    assert wire[:4] == magic
+    assert wire[48:] == bytes(range(6 * channels))
+    # A receiver that knows depth alone, as those before there was colour, says what came.
+    with pytest.raises(FrameError, match="bytes do not hold 3x2 pixels of depth"):
+        Frame.from_bytes(b"ADF1" + wire[4:])
+    with pytest.raises(FrameError, match="magic b'ARX1', expected b'ADF1'"):
+        Frame.from_bytes(b"ARX1" + wire[4:])
+    with pytest.raises(UsageError, match=f"^{kind} camera: it gives no depth; accepted: depth"):
+        _ = Frame.from_bytes(wire).depth_mm
 
 
 @pytest.mark.parametrize("width", [128, 40, 7])

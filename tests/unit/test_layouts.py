@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
+from numpy.typing import NDArray
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
@@ -17,18 +19,19 @@ from airl_mav.camera.frame import depth_to_z16
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.errors import FieldError
 from airl_mav.envs import encoding
+from airl_mav.policy.images import NUMPY, Bytes, shrink_depth
 from airl_mav.policy.layouts import (
     STRIP_ROWS,
-    Bytes,
     Encoded,
     ObservationSpec,
     ablated,
     boxes,
     camera_mismatch,
     encode_layout,
-    shrink,
+    newest_frame,
 )
 from airl_mav.policy.observation import Kinematics, Observation, observe
+from airl_mav.profiles.camera_kind import CHANNELS, KINDS, CameraKind
 
 FAR_MM = 65_535
 
@@ -59,7 +62,7 @@ def seen(depth_mm: Any, **more: Any) -> Observation:
         "pitch": np.zeros(n),
         "yaw": np.zeros(n),
     }
-    return Observation(depth_mm=depth, intrinsics=lens(width, height), **(still | more))
+    return Observation(image=depth, intrinsics=lens(width, height), **(still | more))
 
 
 def grey(layout: ObservationSpec, depth_m: float | None) -> int:
@@ -303,7 +306,7 @@ def test_images_of_the_decisions_before_are_stacked_the_newest_first() -> None:
     depth, state, goal = random_state(4)
     before = tuple(np.roll(depth, k, axis=0) for k in (1, 2))
     for kept in range(3):
-        looked = observe(depth, lens(64, 48), state, goal, earlier_mm=before[:kept])
+        looked = observe(depth, lens(64, 48), state, goal, earlier=before[:kept])
         # Of one vehicle, as the companion has it.
         alone = looked.rows(2).rows(None)
         for seen_, rows in ((looked, slice(None)), (alone, [2])):
@@ -401,8 +404,8 @@ def test_the_compiled_images_are_those_of_numpy(rows: int, columns: int) -> None
     depth[rng.random(depth.shape) < 0.2] = 0
     depth[0, :4] = (1 << 16) - 1
     bytes_of = Bytes(rng.integers(0, 256, 1 << 16).astype(np.uint8))
-    wanted = shrink(depth, rows, columns, bytes_of)
-    np.testing.assert_array_equal(encoding.shrink(depth, rows, columns, bytes_of), wanted)
+    wanted = shrink_depth(depth, rows, columns, bytes_of)
+    np.testing.assert_array_equal(encoding.shrink_depth(depth, rows, columns, bytes_of), wanted)
 
 
 @pytest.mark.parametrize("range_m", [3.0, 5.0, 10.0, 12.5, 18.0, 20.0, 30.0, 65.0])
@@ -410,5 +413,64 @@ def test_the_compiled_images_in_proportion_are_those_of_the_table(range_m: float
     """Of every depth that there is, at ranges that single precision serves and one (18 m) not."""
     depth = np.arange(1 << 16, dtype=np.uint16).reshape(1, 256, 256)
     layout = spec(height=256, width=256, range_m=range_m)
-    found = encode_layout(layout, seen(depth), encoding.shrink)["depth"]
-    np.testing.assert_array_equal(found, encode_layout(layout, seen(depth), shrink)["depth"])
+    found = encode_layout(layout, seen(depth), encoding.COMPILED)["depth"]
+    np.testing.assert_array_equal(found, encode_layout(layout, seen(depth), NUMPY)["depth"])
+
+
+# --- colour
+
+
+def random_colours(kind: CameraKind, n: int = 3, seed: int = 7) -> NDArray[np.uint8]:
+    rng = np.random.default_rng(seed)
+    return rng.integers(0, 256, (n, 48, 64, CHANNELS[kind]), np.uint8)
+
+
+def coloured(image: NDArray[np.uint8], kind: CameraKind, **more: Any) -> Observation:
+    known = seen(np.zeros(image.shape[:3], np.uint16))
+    camera = Intrinsics.from_fov(64, 48, math.pi / 2, kind=kind)
+    return replace(known, image=image, intrinsics=camera, **more)
+
+
+@pytest.mark.parametrize("kind", ["rgb", "grey"])
+@pytest.mark.parametrize(("rows", "columns"), [(48, 64), (24, 32), (16, 64), (12, 16)])
+def test_a_colour_is_the_mean_of_its_block(kind: CameraKind, rows: int, columns: int) -> None:
+    image = random_colours(kind)
+    layout = spec(height=rows, width=columns, kind=kind)
+    found = encode_layout(layout, coloured(image, kind))[kind]
+    tall, wide = 48 // rows, 64 // columns
+    blocks = image.reshape(3, rows, tall, columns, wide, -1).mean(axis=(2, 4))
+    wanted = np.floor(np.moveaxis(blocks, -1, 1) + 0.5)
+    np.testing.assert_array_equal(found, wanted)
+    assert found.dtype == np.uint8
+    assert found.shape[1:] == boxes(layout)[kind].shape == (CHANNELS[kind], rows, columns)
+    compiled = encode_layout(layout, coloured(image, kind), encoding.COMPILED)[kind]
+    np.testing.assert_array_equal(compiled, found)
+
+
+@pytest.mark.parametrize("kind", ["rgb", "grey"])
+def test_colours_are_stacked_the_newest_first_and_black_before_the_first(kind: CameraKind) -> None:
+    image, before = random_colours(kind), random_colours(kind, seed=8)
+    layout = spec(height=48, width=64, kind=kind, frames=3)
+    stack = encode_layout(layout, coloured(image, kind, earlier=(before,)))[kind]
+    channels = CHANNELS[kind]
+    assert stack.shape == (3, 3 * channels, 48, 64)
+    np.testing.assert_array_equal(stack[:, :channels], np.moveaxis(image, -1, 1))
+    np.testing.assert_array_equal(stack[:, channels : 2 * channels], np.moveaxis(before, -1, 1))
+    assert not stack[:, 2 * channels :].any()
+    one = {key: values[1] for key, values in encode_layout(layout, coloured(image, kind)).items()}
+    np.testing.assert_array_equal(newest_frame(layout, one), image[1].squeeze())
+
+
+def test_the_paper_s_layout_draws_its_strip_into_depth_alone() -> None:
+    with pytest.raises(
+        ValidationError, match="kind = 'rgb': accepted: 'depth' with layout 'paper'"
+    ):
+        spec("paper", 34, kind="rgb")
+
+
+@pytest.mark.parametrize("asked", KINDS)
+@pytest.mark.parametrize("given", KINDS)
+def test_a_camera_serves_what_it_gives(asked: CameraKind, given: CameraKind) -> None:
+    camera = Intrinsics.from_fov(64, 48, math.pi / 2, kind=given)
+    wanted = None if asked == given else f"{given} camera; accepted: {asked}"
+    assert camera_mismatch(spec(kind=asked), camera) == wanted

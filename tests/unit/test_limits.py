@@ -13,11 +13,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from airl_mav.camera.frame import Frame
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.constants import US_PER_S
 from airl_mav.policy.observation import Kinematics
+from airl_mav.profiles.camera_kind import CameraKind
 from airl_mav.scenario.model import LimitSettings, PilotSettings
 from companion.camera import ReceivedFrame
 from companion.interfaces import FRAMES_LATE, TELEMETRY_FROZEN, VehicleStatus
@@ -87,7 +89,7 @@ def of_state(name: str, change: Callable[[np.ndarray, np.ndarray, float], np.nda
 
 
 def of_depth(change: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Lie:
-    return lambda now, then, s: now.seen(depth_mm=change(now.frame.depth_mm, then.frame.depth_mm))
+    return lambda now, then, s: now.seen(image=change(now.frame.image, then.frame.image))
 
 
 def later(seconds: Callable[[float], float]) -> Lie:
@@ -189,7 +191,7 @@ LIES: dict[str, tuple[Lie, str, float]] = {
     ),
     "another size": (
         lambda now, then, s: now.seen(
-            intrinsics=Intrinsics.from_fov(4, 3, 1.5), depth_mm=np.ones((3, 4), np.uint16)
+            intrinsics=Intrinsics.from_fov(4, 3, 1.5), image=np.ones((3, 4), np.uint16)
         ),
         CAMERA_WRONG,
         0.0,
@@ -317,3 +319,54 @@ def test_only_what_must_be_ground_is_missed() -> None:
     assert not ground_in_view(frame, replace(level, quaternion=braking), 0.0)
     assert not ground_in_view(frame, replace(level, position=np.array([0.0, 0.0, -9.9])), 0.0)
     assert ground_in_view(frame, replace(level, position=np.array([0.0, 0.0, -5.0])), 0.0)
+
+
+# --- colour
+
+
+def colour(
+    kind: CameraKind, shows: Callable[[float], NDArray[np.uint8]]
+) -> Callable[[float], Told]:
+    """Return an honest flight with a colour camera that shows a picture over time."""
+    lens = replace(LENS, kind=kind)
+    return lambda t_s: honest(t_s).seen(image=shows(t_s), intrinsics=lens)
+
+
+def scene(t_s: float, kind: CameraKind = "rgb") -> NDArray[np.uint8]:
+    """Return a picture that moves on."""
+    lens = replace(LENS, kind=kind)
+    pixels = np.arange(math.prod(lens.shape)) + round(30 * t_s)
+    return (pixels % 251).astype(np.uint8).reshape(lens.shape)
+
+
+@pytest.mark.parametrize("kind", ["rgb", "grey"])
+@pytest.mark.parametrize(
+    ("shows", "ending"),
+    [
+        (lambda t_s, kind: scene(t_s, kind), None),
+        (lambda t_s, kind: scene(min(t_s, 4.0), kind), CAMERA_FROZEN),
+        (lambda t_s, kind: np.zeros_like(scene(t_s, kind)), CAMERA_WRONG),
+        (lambda t_s, kind: np.full_like(scene(t_s, kind), 255), CAMERA_WRONG),
+        # A wall without texture that fills the picture.
+        (lambda t_s, kind: np.full_like(scene(t_s, kind), 120), None),
+    ],
+    ids=["moving", "frozen", "black", "white", "wall"],
+)
+def test_pictures_of_a_colour_camera(
+    kind: CameraKind, shows: Callable[[float, CameraKind], NDArray[np.uint8]], ending: str | None
+) -> None:
+    found, at_s = fly(colour(kind, lambda t_s: shows(t_s, kind)), 0.1, 12.0, LimitSettings())
+    assert (None if found is None else found.reason) == ending
+    if found is not None and ending == CAMERA_WRONG:
+        assert "of 255, and the ground must be in view" in found.detail
+        assert at_s == pytest.approx(2.2, abs=0.15)
+
+
+def test_another_kind_of_image_is_another_camera() -> None:
+    def told(t_s: float) -> Told:
+        return honest(t_s) if t_s < 3.0 else colour("rgb", scene)(t_s)
+
+    found, at_s = fly(told, 0.1, 12.0, LimitSettings())
+    assert found is not None
+    assert found.reason == CAMERA_WRONG
+    assert at_s == pytest.approx(3.0, abs=0.11)

@@ -660,3 +660,20 @@ def test_a_pinhole_is_written_down_as_it_was_before_there_were_others() -> None:
     assert Camera.model_validate(camera.model_dump()) == camera
     round_ = load_vehicle("quad-panorama").camera
     assert Camera.model_validate_json(round_.model_dump_json()) == round_
+
+
+def test_a_camera_s_kind_is_one_of_three(tmp_path: Path) -> None:
+    camera = load_vehicle("quad-rgb").camera
+    assert camera.kind == "rgb"
+    assert Camera.model_validate_json(camera.model_dump_json()) == camera
+    # Profiles that say nothing of it are written down as before there was colour.
+    assert "kind" not in load_vehicle("quad").camera.model_dump()
+    file = tmp_path / "mine.toml"
+    file.write_text('base = "quad"\n[camera]\nkind = "rgbd"\n')
+    with pytest.raises(
+        UsageError, match=r"camera.kind = 'rgbd': accepted: 'depth', 'rgb' or 'grey'"
+    ):
+        load_vehicle(str(file))
+    file.write_text('base = "quad-d435"\n[camera]\nkind = "grey"\n')
+    with pytest.raises(UsageError, match=r"camera.kind = 'grey': with a table camera.stereo"):
+        load_vehicle(str(file))

@@ -44,7 +44,7 @@ from airl_mav.view.messages import (
     to_parts,
 )
 from airl_mav.view.pace import Pace
-from airl_mav.view.pictures import NO_RETURN, depth_picture, numbers_html, texts_html
+from airl_mav.view.pictures import NO_RETURN, camera_picture, numbers_html, texts_html
 from airl_mav.view.shown import STRIP_S, Shown
 from airl_mav.view.viewer import Viewer, request_of
 from tests.support.ports import free_ports
@@ -241,7 +241,7 @@ def test_a_new_episode_forgets_the_old_one() -> None:
 
 
 def test_near_is_bright_and_nothing_is_dark() -> None:
-    picture = depth_picture(np.array([[0, 500, 9_000]], np.uint16), range_m=10.0)
+    picture = camera_picture(np.array([[0, 500, 9_000]], np.uint16), range_m=10.0)
     side = picture.shape[1] // 3
     nothing, near, far = picture[0, side // 2], picture[0, 3 * side // 2], picture[0, 5 * side // 2]
     assert tuple(nothing) == NO_RETURN

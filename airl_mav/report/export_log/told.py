@@ -39,6 +39,7 @@ from airl_mav.flight.smoothness import commanded_velocity
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.stages import stage_durations
 from airl_mav.latency.stamps import NO_STAMP
+from airl_mav.profiles.camera_kind import CameraKind
 from airl_mav.report.export_log.foxglove_types import (
     CAMERA,
     ESTIMATE,
@@ -77,6 +78,13 @@ SAMPLES_A_STATUS = 25
 
 REFEREE = "referee"
 """Who says how a flight ended."""
+
+IMAGES: dict[CameraKind, tuple[str, str]] = {
+    "depth": ("16UC1", "/camera/depth"),
+    "rgb": ("rgb8", "/camera/image"),
+    "grey": ("mono8", "/camera/image"),
+}
+"""Encoding of a camera's images, and their topic."""
 
 
 class Told(NamedTuple):
@@ -205,23 +213,24 @@ class FlightMessages:
         )
 
     def _seen(self) -> Iterator[Told]:
-        """Give the depth image that each decision saw, at its exposure."""
+        """Give the image that each decision saw, at its exposure."""
         columns = self.flight.decisions
         for time_us in np.unique(columns.get("capture_us", np.zeros(0, np.int64))).tolist():
-            depth_mm = None if time_us == NO_STAMP else self._replayed.image_mm(time_us)
-            if depth_mm is None:
+            seen = None if time_us == NO_STAMP else self._replayed.image(time_us)
+            if seen is None:
                 continue
-            height, width = depth_mm.shape
+            height, width = seen.shape[:2]
+            encoding, topic = IMAGES[self._camera.intrinsics.kind]
             image = RawImage(
                 timestamp=timestamp(self._unix_us(time_us)),
                 frame_id=CAMERA,
                 width=width,
                 height=height,
-                encoding="16UC1",
-                step=2 * width,
-                data=np.ascontiguousarray(depth_mm, "<u2").tobytes(),
+                encoding=encoding,
+                step=seen.nbytes // height,
+                data=np.ascontiguousarray(seen, seen.dtype.newbyteorder("<")).tobytes(),
             )
-            yield self._drawn(time_us, "/camera/depth", image)
+            yield self._drawn(time_us, topic, image)
 
     # --- numbers and texts, as in a black box
 

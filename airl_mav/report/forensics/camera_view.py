@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena, Obstacles, Shape
+from airl_mav.camera.colour import RANGE_M
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import Mount, camera_pose, render
 from airl_mav.control.attitude import heading_of
@@ -27,13 +28,15 @@ class PolicyCamera:
 
     intrinsics: Intrinsics
     range_m: float
+    """Farthest depth that gives a return [m]; of a colour camera farther than every arena."""
     mount: Mount
 
     @classmethod
     def of(cls, camera: Camera) -> PolicyCamera:
         """Return the camera of a vehicle."""
         mount = Mount((camera.forward_m, 0.0, -camera.up_m), math.radians(camera.pitch_up_deg))
-        return cls(Intrinsics.of(camera), camera.range_m, mount)
+        range_m = camera.range_m if camera.kind == "depth" else RANGE_M
+        return cls(Intrinsics.of(camera), range_m, mount)
 
     @property
     def half_angle_rad(self) -> float:

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena
-from airl_mav.camera.frame import depth_to_z16
-from airl_mav.camera.render import camera_pose, render
+from airl_mav.camera.exposure import expose
+from airl_mav.camera.render import camera_pose
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.files import Arrays
 from airl_mav.flight.record import EpisodeRecord
@@ -21,12 +21,13 @@ from airl_mav.report.forensics.camera_view import PolicyCamera, pose_at
 from airl_mav.view.messages import (
     ArenaShown,
     Decided,
-    Depth,
     Episode,
     Flight,
+    Image,
     Said,
     Vehicle,
     VehicleShape,
+    shape_of,
 )
 from airl_mav.view.shown import OFFBOARD, STRIP_S, TRAIL_STEP_M, Shown
 
@@ -118,8 +119,8 @@ class ReplayedFlight:
         number = int(np.searchsorted(self.sent_us, time_us, side="right")) - 1
         return None if number < 0 else number
 
-    def image_mm(self, time_us: int) -> Depth | None:
-        """Return what the camera saw at a time (h, w) [mm], without noise; None: no arena."""
+    def image(self, time_us: int) -> Image | None:
+        """Return what the camera saw at a time, without noise; None: no arena."""
         if self.arena is None:
             return None
         camera = PolicyCamera.of(self.vehicle.camera)
@@ -127,8 +128,7 @@ class ReplayedFlight:
         from_us = time_us - self.record.started_us
         at, attitude = camera_pose(position, quaternion, camera.mount)
         centers = self.arena.centers_at(from_us)
-        depth_m = render(self.arena, centers, camera.intrinsics, camera.range_m, at, attitude)
-        return depth_to_z16(depth_m)
+        return expose(self.arena, centers, camera.intrinsics, camera.range_m, at, attitude)
 
     def show(self, shown: Shown, seconds: float) -> None:
         """Make `shown` what it was so long after the reset [s]; episode and arena are there."""
@@ -158,12 +158,12 @@ class ReplayedFlight:
         ages = self.ages
         inside = (ages[:, 0] > seconds - STRIP_S) & (ages[:, 0] <= seconds)
         shown.ages = deque(map(tuple, ages[inside].tolist()))
-        shown.picture_mm = self.image_mm(time_us)
+        shown.picture = self.image(time_us)
 
     def _show_decision(self, shown: Shown, time_us: int) -> None:
         number = self.decision(time_us)
         if number is None:
-            shown.decided = shown.decided_mm = None
+            shown.decided = shown.decided_image = None
             shown.decisions = 0
             return
         if shown.decided is not None and shown.decisions == number + 1:
@@ -173,8 +173,8 @@ class ReplayedFlight:
             for name in ("capture_us", "infer_start_us", "action_ready_us", "sent_us")
         )
         forward, right, down, turn = (float(part) for part in self.stamps["setpoint"][number])
-        image = self.image_mm(captured_us)
-        shown.decided_mm, shown.decisions = image, number + 1
+        image = self.image(captured_us)
+        shown.decided_image, shown.decisions = image, number + 1
         shown.decided = Decided(
             captured_us=captured_us,
             began_us=began_us,
@@ -183,7 +183,7 @@ class ReplayedFlight:
             expires_us=None,
             setpoint=(forward, right, down, turn),
             compensated=self.compensated,
-            shape=(1, 1) if image is None else (image.shape[0], image.shape[1]),
+            shape=(1, 1) if image is None else shape_of(image),
         )
 
     def begin(self, shown: Shown) -> None:

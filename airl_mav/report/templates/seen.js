@@ -20,7 +20,10 @@ function makeSeen(palette, goTo) {
     canvas.height = height;
     const bytes = Uint8Array.from(atob(seen.image), (letter) => letter.charCodeAt(0));
     const image = new ImageData(width, height);
-    bytes.forEach((byte, i) => image.data.set([...colours[byte], 255], 4 * i));
+    const colour = bytes.length > width * height;
+    for (let i = 0; i < width * height; i++) {
+      image.data.set([...(colour ? bytes.subarray(3 * i, 3 * i + 3) : colours[bytes[i]]), 255], 4 * i);
+    }
     canvas.getContext("2d").putImageData(image, 0, 0);
     const { sent, taken } = decisions[seen.number];
     const [forward, right, turn] = ["forward_m_s", "right_m_s", "yaw_rate_deg_s"].map((key) => numbers(flight.commands[key])[seen.number]);

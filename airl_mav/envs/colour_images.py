@@ -1,0 +1,169 @@
+"""The colour images of n vehicles in one compiled call, and how their arenas look."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.arena.appearance import OBSTACLE
+from airl_mav.arena.geometry import Arena
+from airl_mav.camera.colour import Work, render_colour
+from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.picture import ColourArrays, write_grey
+from airl_mav.camera.render import Mount, camera_pose
+from airl_mav.camera.textures import atlas
+from airl_mav.core.kernels import kernel
+from airl_mav.envs.arenas import ArenaBatch, move_obstacles
+from airl_mav.envs.fleet import Fleet
+
+
+class LookBatch(NamedTuple):
+    """The looks of n arenas as `render_colour` takes them, padded to the most surfaces."""
+
+    texture: NDArray[np.int8]  # (n, m)
+    per_m: NDArray[np.float32]  # (n, m)
+    offset: NDArray[np.float32]  # (n, m, 2)
+    albedo: NDArray[np.float32]  # (n, m, 2, 3)
+    lights: NDArray[np.float32]  # (n, 7, 3)
+
+
+def _empty(n: int, surfaces: int) -> LookBatch:
+    return LookBatch(
+        np.zeros((n, surfaces), np.int8),
+        np.zeros((n, surfaces), np.float32),
+        np.zeros((n, surfaces, 2), np.float32),
+        np.zeros((n, surfaces, 2, 3), np.float32),
+        np.zeros((n, 7, 3), np.float32),
+    )
+
+
+class Looks:
+    """How the arenas of n slots look."""
+
+    def __init__(self, n: int) -> None:
+        """Know none yet."""
+        self.batch = _empty(n, OBSTACLE)
+        """What the kernel looks at; replaced where an arena has more surfaces than all before."""
+
+    def put(self, i: int, arena: Arena) -> None:
+        """Take the look of slot i's arena."""
+        look = ColourArrays.of(arena.look)
+        room, count = self.batch.texture.shape[1], len(look.texture)
+        if count > room:
+            larger = _empty(len(self.batch.texture), count)
+            arrays: Iterable[tuple[NDArray[Any], NDArray[Any]]] = zip(
+                self.batch, larger, strict=True
+            )
+            for old, new in arrays:
+                new[tuple(map(slice, old.shape))] = old
+            self.batch = larger
+        batch = self.batch
+        batch.lights[i] = look.lights
+        for name in ("texture", "per_m", "offset", "albedo"):
+            getattr(batch, name)[i, :count] = getattr(look, name)
+
+    def restore(self, arenas: Sequence[Arena | None]) -> None:
+        """Take the looks of all slots again; None: no episode has begun there."""
+        for i, arena in enumerate(arenas):
+            if arena is not None:
+                self.put(i, arena)
+
+
+class ColourImages:
+    """Renders the images of n vehicles with one colour camera each."""
+
+    def __init__(self, intrinsics: Intrinsics, mount: Mount, looks: Looks) -> None:
+        """Take the camera, its place on the body, and how the arenas look."""
+        k = intrinsics
+        self._lens = (k.focal, k.cx, k.cy, k.cylindrical)
+        self._mount, self._looks = mount, looks
+        self._work = Work.of(k.width, k.height, k.cylindrical)
+        shape = (k.height, k.width)
+        self._rgb = np.zeros((*shape, 3), np.uint8)
+        self._depth, self._seen = np.zeros(shape, np.float32), np.zeros(shape, np.int32)
+
+    def render(
+        self, fleet: Fleet, arenas: ArenaBatch, who: NDArray[np.bool_], out: NDArray[Any]
+    ) -> None:
+        """Write the images (n, h, w, 3), or (n, h, w, 1) in grey, of the vehicles in `who` (n,)."""
+        room = self._work, self._rgb, self._depth, self._seen
+        render_colour_images(
+            fleet, arenas, self._looks.batch, who, self._mount, *self._lens, *room, atlas(), out
+        )
+
+
+@kernel
+def render_colour_images(
+    fleet: Fleet,
+    arenas: ArenaBatch,
+    looks: LookBatch,
+    who: NDArray[np.bool_],
+    mount: Mount,
+    focal: float,
+    cx: float,
+    cy: float,
+    cylindrical: bool,
+    work: Work,
+    rgb: NDArray[np.uint8],
+    depth: NDArray[np.float32],
+    seen: NDArray[np.int32],
+    patterns: NDArray[np.float32],
+    out: NDArray[np.uint8],
+) -> None:
+    """Render the colour image of every vehicle in `who`, from where it is now.
+
+    Args:
+        fleet: Poses and times.
+        arenas: One a vehicle; moving obstacles are put where they are at its time.
+        looks: One an arena.
+        who: (n,) whose image is rendered; the others' stays as it is.
+        mount: The camera's place on the body.
+        focal: Focal length [px], or columns for an angle of a cylinder [px/rad].
+        cx: Column of the optical axis [px].
+        cy: Row of the optical axis [px].
+        cylindrical: The image is a cylinder's.
+        work: Room to work in, with the next three.
+        rgb: (h, w, 3).
+        depth: (h, w).
+        seen: (h, w).
+        patterns: `textures.atlas()`.
+        out: (n, h, w, channels) sRGB, or grey where there is one channel, written.
+    """
+    grey = out.shape[3] == 1
+    for i in range(len(who)):
+        if not who[i]:
+            continue
+        move_obstacles(arenas, i, fleet.time_us[i])
+        count = arenas.n_obstacles[i]
+        surfaces = OBSTACLE + count
+        position, quaternion = camera_pose(fleet.position[i], fleet.quaternion[i], mount)
+        image = rgb if grey else out[i]
+        render_colour(
+            image,
+            depth,
+            seen,
+            work,
+            position,
+            quaternion,
+            focal,
+            cx,
+            cy,
+            cylindrical,
+            arenas.bounds[i],
+            arenas.shape[i, :count],
+            arenas.center[i, :count],
+            arenas.half_size[i, :count],
+            arenas.yaw[i, :count],
+            looks.texture[i, :surfaces],
+            looks.per_m[i, :surfaces],
+            looks.offset[i, :surfaces],
+            looks.albedo[i, :surfaces],
+            looks.lights[i],
+            patterns,
+        )
+        if grey:
+            pixels = rgb.shape[0] * rgb.shape[1]
+            write_grey(out[i].reshape(pixels), rgb.reshape(pixels, 3))
