@@ -1,0 +1,149 @@
+"""A vehicle with a colour camera, from training to a flight in lockstep."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from airl_mav.camera.frame import Frame
+from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.core.errors import FieldError
+from airl_mav.envs.arenas import batch_of
+from airl_mav.envs.colour_images import ColourImages, Looks
+from airl_mav.envs.encoding import COMPILED
+from airl_mav.envs.fleet import new_fleet
+from airl_mav.lockstep.flight import fly
+from airl_mav.policy.actions import Action
+from airl_mav.policy.card import load_card
+from airl_mav.policy.layouts import encode_layout
+from airl_mav.policy.learned import LearnedPolicy
+from airl_mav.policy.observation import Observation
+from airl_mav.scenario.resolved import ResolvedScenario
+from firmware_sim.plant.camera_server import SimulatedCamera
+from tests.support.command_line import airl
+from tests.support.lockstep_kit import demo_scenario
+
+SEED = 3
+
+TRAINING = """
+description = "a short one in colour"
+steps = 300
+vehicles = 8
+[environment]
+vehicle = "quad-rgb"
+arena = "static-obstacles"
+image_width_px = 32
+image_height_px = 24
+frames = 2
+[algorithm]
+learning_starts = 100
+[selection]
+every = 300
+episodes = 2
+"""
+
+
+class Watching:
+    """A learned policy, and what it was shown."""
+
+    def __init__(self, policy: LearnedPolicy, seen: list[Observation]) -> None:
+        self._policy, self._seen = policy, seen
+
+    def act(self, observation: Observation) -> Action:
+        self._seen.append(observation)
+        return self._policy.act(observation)
+
+
+@pytest.fixture(scope="module")
+def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of a policy that was trained to see colour."""
+    folder = tmp_path_factory.mktemp("colour")
+    (folder / "rgb.toml").write_text(TRAINING, encoding="utf-8")
+    code, text = airl("train", str(folder / "rgb.toml"), "--out", str(folder / "run"))
+    assert code == 0, text
+    return folder / "run" / "policy"
+
+
+def scenario(policy: Path, **changes: object) -> ResolvedScenario:
+    asked = {"vehicle": "quad-rgb", "arena": "static-obstacles", "policy": str(policy)}
+    return demo_scenario(**({"time_limit_s": 5.0} | asked | changes))
+
+
+def test_a_trained_policy_says_that_it_sees_colour(policy: Path) -> None:
+    card = load_card(policy)
+    assert card.observation.kind == "rgb"
+    assert card.observation.channels == 6
+    assert json.loads((policy / "card.json").read_text())["observation"]["kind"] == "rgb"
+    assert "| sees | rgb image of 32x24 px, 90 deg wide; own velocity" in (
+        policy / "README.md"
+    ).read_text(encoding="utf-8")
+
+
+def test_it_is_evaluated_at_level_gym(policy: Path, tmp_path: Path) -> None:
+    words = ["--level", "gym", "--vehicle", "quad-rgb", "--episodes", "2", "--time-limit-s", "5"]
+    code, text = airl("evaluate", str(policy), *words, "--out", str(tmp_path / "out"))
+    assert code == 0, text
+
+
+def test_the_companion_gets_the_images_that_the_twin_renders(
+    policy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To the bit, on the wire and as the network sees them."""
+    taken: dict[int, tuple[np.ndarray, np.ndarray, Frame]] = {}
+    real = SimulatedCamera.capture
+
+    def capture(
+        self: SimulatedCamera, time_us: int, position: np.ndarray, quaternion: np.ndarray
+    ) -> Frame:
+        frame = real(self, time_us, position, quaternion)
+        taken[time_us] = np.array(position), np.array(quaternion), frame
+        return frame
+
+    monkeypatch.setattr(SimulatedCamera, "capture", capture)
+    asked, seen = scenario(policy, arena="dynamic-obstacles"), list[Observation]()
+    learned = asked.fresh_policy(SEED)
+    assert isinstance(learned, LearnedPolicy)
+    flown = fly(asked, Watching(learned, seen), 0, SEED)
+    captures = flown.latency["capture_us"]
+    assert len(seen) == len(captures) > 5
+    camera, arena = asked.vehicle.camera, asked.arena_of(SEED)
+    looks = Looks(1)
+    looks.put(0, arena)
+    mount = SimulatedCamera(camera, arena)._mount
+    twin = ColourImages(Intrinsics.of(camera), mount, looks)
+    fleet, arenas, image = new_fleet(1), batch_of([arena]), np.zeros((1, 48, 64, 3), np.uint8)
+    spec = learned.card.observation
+    for each, capture_us in zip(seen, captures.tolist(), strict=True):
+        fleet.position[0], fleet.quaternion[0], frame = taken[capture_us]
+        fleet.time_us[0] = capture_us - flown.record.started_us
+        twin.render(fleet, arenas, np.ones(1, np.bool_), image)
+        wired = Frame.from_bytes(frame.to_bytes())
+        assert wired.intrinsics == each.intrinsics == Intrinsics.of(camera)
+        assert wired.image.tobytes() == each.image.tobytes() == image[0].tobytes()
+        ours, theirs = (
+            encode_layout(spec, each.rows(None)),
+            encode_layout(spec, each.rows(None), COMPILED),
+        )
+        assert ours["rgb"].tobytes() == theirs["rgb"].tobytes()
+    # It is a picture, in colours, and another one each time.
+    assert len(np.unique(image.reshape(-1, 3), axis=0)) > 100
+    assert len({each.image.tobytes() for each in seen}) == len(seen)
+    assert [len(each.earlier) for each in seen[:3]] == [0, 1, 2]
+
+
+def test_what_does_not_see_alike_is_refused_in_one_line(policy: Path) -> None:
+    with pytest.raises(FieldError, match=r"vehicle quad: depth camera; accepted: rgb"):
+        scenario(policy, vehicle="quad")
+    for depth in ("static-obstacles", "greedy"):
+        told = r"does not fit vehicle quad-rgb: rgb camera; accepted: depth"
+        with pytest.raises(FieldError, match=told):
+            scenario(Path(depth))
+    with pytest.raises(FieldError, match=r"compensate.*only depth can be carried forward"):
+        scenario(policy, compensate=True)
+    with pytest.raises(FieldError, match=r"sensors\.depth_noise.*camera of kind 'rgb'"):
+        scenario(policy, sensors={"depth_noise": 0.1})
+    with pytest.raises(FieldError, match=r"faults.*a depth camera; the vehicle's is of kind 'rgb'"):
+        scenario(policy, faults=("camera noise 0.1 at offboard",))
