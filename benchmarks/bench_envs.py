@@ -107,12 +107,16 @@ def measure_ours() -> list[Result]:
 
         return result(name, step_s, 1.0 / TICK_S, *fastest(stretch))
 
-    def measure_whole(arena: str) -> Result:
+    def measure_whole(arena: str, kind: str) -> Result:
         """The vector environment as a learner sees it: delays, images, rewards, new arenas."""
         from airl_mav.envs.spec import spec_of
         from airl_mav.envs.vector import NavigationVectorEnv
 
-        spec = spec_of(None, {"arena": arena, "episode": {"hold_s": CAMERA_STEP_S}})
+        knobs = {"camera": {"kind": kind}, "image_width_px": WIDTH, "image_height_px": HEIGHT}
+        hold = {"hold_s": CAMERA_STEP_S}
+        spec = spec_of(
+            None, {"arena": arena, "episode": hold, **(knobs if kind != "depth" else {})}
+        )
         env = NavigationVectorEnv(N, spec)
         env.reset(seed=1)
         rng = np.random.default_rng(0)
@@ -123,7 +127,10 @@ def measure_ours() -> list[Result]:
                 env.step(rng.integers(0, 25, N))
             return 20.0 * N, time.process_time() - start
 
-        name = "airl-mav, the same as a Gymnasium VectorEnv"
+        same = "the same as a Gymnasium VectorEnv"
+        if kind != "depth":
+            same += f", {kind} that the network sees whole"
+        name = f"airl-mav, {same}"
         return result(name, CAMERA_STEP_S, 1.0 / TICK_S, *fastest(stretch))
 
     return [
@@ -134,7 +141,9 @@ def measure_ours() -> list[Result]:
         measure(
             f"airl-mav, {OBSTACLES} obstacles, depth", "dynamic-obstacles", CAMERA_STEP_S, True
         ),
-        measure_whole("dynamic-obstacles"),
+        measure_whole("dynamic-obstacles", "depth"),
+        measure_whole("dynamic-obstacles", "rgb"),
+        measure_whole("dynamic-obstacles", "grey"),
     ]
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from airl_mav.envs.evaluation import fly_episodes
 from airl_mav.envs.spec import EnvironmentSpec
+from airl_mav.profiles.camera_kind import KINDS
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.aircraft import HAS_PYBULLET, PlantName
 from firmware_sim.warm_up import warm_up
@@ -16,6 +17,8 @@ from firmware_sim.warm_up import warm_up
 for plant in get_args(PlantName):
     if plant == "kernel" or HAS_PYBULLET:
         warm_up(load_vehicle("quad"), plant)
-spec = EnvironmentSpec.model_validate({"episode": {"time_limit_s": 1.0}})
-for _ in fly_episodes(spec, lambda seen: np.zeros(len(seen["goal"]), np.int64), [1]):
-    pass
+for kind in KINDS:
+    short = {"episode": {"time_limit_s": 1.0}, "camera": {"kind": kind}}
+    spec = EnvironmentSpec.model_validate(short)
+    for _ in fly_episodes(spec, lambda seen: np.zeros(len(seen["goal"]), np.int64), [1]):
+        pass
