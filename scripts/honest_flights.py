@@ -23,8 +23,8 @@ import numpy as np
 import tyro
 from flown_lines import FlownLines
 from plants_compared import PAIRS
-from rich.console import Console
 
+from airl_mav.core.console import new_console
 from airl_mav.core.errors import EXIT_USAGE, UsageError
 from airl_mav.core.provenance import provenance
 from airl_mav.flight.judge import Outcome
@@ -151,7 +151,7 @@ def view_of(rows: Sequence[dict[str, str]]) -> TableView:
 
 def main(words: Sequence[str] | None = None) -> int:
     """Fly what is missing, and count."""
-    asked, console = tyro.cli(Command, args=words, description=__doc__), Console()
+    asked, console = tyro.cli(Command, args=words, description=__doc__), new_console()
     behaviour, deciding = behaviour_today(), dict(PAIRS)
     path = asked.out / FLIGHTS_FILE
     lines = FlownLines(path, COLUMNS)

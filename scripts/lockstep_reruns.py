@@ -21,8 +21,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import tyro
-from rich.console import Console
 from rich.table import Table
+
+from airl_mav.core.console import new_console
 
 BEGINS = "begins"
 
@@ -61,7 +62,7 @@ def main() -> int:
     if command.fly is not None:
         fly(command, command.fly)
         return 0
-    console = Console()
+    console = new_console()
     counts: dict[str, Counter[str]] = {}
     conditions = (("idle", command.idle), ("loaded", command.loaded), ("stopped", command.stopped))
     for name, flights in conditions:

@@ -19,9 +19,9 @@ import numpy as np
 import tyro
 from flown_lines import FlownLines
 from numpy.typing import NDArray
-from rich.console import Console
 from rich.table import Table
 
+from airl_mav.core.console import new_console
 from airl_mav.core.errors import EXIT_USAGE, UsageError
 from airl_mav.flight.judge import Outcome
 from airl_mav.lockstep.flight import fly
@@ -109,7 +109,7 @@ def until_judged(flight: FlownEpisode) -> NDArray[np.float64]:
 
 def main(words: Sequence[str] | None = None) -> int:
     """Compare, and print what was found."""
-    asked, console = tyro.cli(Comparison, args=words), Console()
+    asked, console = tyro.cli(Comparison, args=words), new_console()
     deciding = dict(PAIRS)
     lines = None if asked.out is None else FlownLines(asked.out, COLUMNS)
     known = {} if lines is None else {(p.arena, p.seed): p for p in map(pair_of, lines.rows)}

@@ -29,6 +29,7 @@ from typing import Any
 import tyro
 from rich.console import Console
 
+from airl_mav.core.console import new_console
 from airl_mav.core.progress import RichProgress
 from airl_mav.experiments.campaign import Cell, run_cell
 from airl_mav.experiments.executors import ExecutorSettings
@@ -78,7 +79,7 @@ def work(what: str, out: Path, episodes: int, address: str | None) -> int:
     settings = ExecutorSettings(workers=2)
     if address is not None:
         settings = ExecutorSettings(executor="ray", ray_address=address)
-    with RichProgress(Console(soft_wrap=True)) as progress, open_executor(settings) as executor:
+    with RichProgress(new_console(soft_wrap=True)) as progress, open_executor(settings) as executor:
         if what == "lockstep":
             run = run_cell(out / what, lockstep_cell(episodes), executor, progress=progress)
             complete, error = run.complete, run.error
@@ -197,7 +198,7 @@ def over_two_nodes(command: Command, console: Console) -> None:
             node.wait()
             console.print(f"{what}: both nodes at work; killed all {len(victims)} of the second")
             code = driver.wait()
-            console.print(log.read_text(), markup=False, highlight=False, soft_wrap=True)
+            console.print(log.read_text(), highlight=False, soft_wrap=True)
             if code != 0:
                 raise SystemExit(f"{what}: exit status {code}")
 
@@ -255,7 +256,7 @@ def trainings(out: Path) -> dict[str, Any]:
 
 
 def main(command: Command) -> int:
-    console = Console()
+    console = new_console()
     if os.geteuid() != 0 or shutil.which("ip") is None:
         raise SystemExit("needs root, and `ip` of iproute2, to make network namespaces")
     command = replace(command, out=command.out.absolute())

@@ -22,9 +22,9 @@ from pathlib import Path
 import numpy as np
 import tyro
 from numpy.typing import NDArray
-from rich.console import Console
 
 from airl_mav.core.clock import SimClock
+from airl_mav.core.console import new_console
 from airl_mav.core.constants import TICK_US, US_PER_MS, US_PER_S
 from airl_mav.core.provenance import provenance
 from airl_mav.profiles.vehicle import load_vehicle
@@ -161,7 +161,7 @@ def main(asked: Command) -> None:
         Column("0 to 2 m/s up", "ms"),
     )
     view = TableView("response-taken-apart", "A response taken apart", columns, rows)
-    print_table(view, Console())
+    print_table(view, new_console())
     command = shlex.join(["python", "scripts/response_taken_apart.py", *sys.argv[1:]])
     write_table(view, asked.out, provenance(command))
 

@@ -19,10 +19,10 @@ from pathlib import Path
 
 import tyro
 from lockstep_reruns import busy
-from rich.console import Console
 from rich.table import Table
 
 from airl_mav import load_run
+from airl_mav.core.console import new_console
 from airl_mav.core.errors import EXIT_BROKEN, EXIT_INVALID
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
@@ -64,7 +64,7 @@ def main() -> int:
             row, wrong = rehearse(asked, number, more)
             table.add_row(f"{number}", *row, wrong)
             broken += bool(wrong)
-    console = Console()
+    console = new_console()
     console.print(table)
     console.print(f"{asked.runs - broken} of {asked.runs} runs keep the rule", highlight=False)
     return 1 if broken else 0

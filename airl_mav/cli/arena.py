@@ -11,6 +11,7 @@ from rich.console import Console
 from airl_mav.arena.describe import arena_table
 from airl_mav.arena.generate import generate
 from airl_mav.cli.options import POSITIONAL
+from airl_mav.core.console import new_console
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity
@@ -77,7 +78,7 @@ def run(options: ArenaOptions, console: Console | None = None) -> int:
     Raises:
         UsageError: The arena cannot be made, or the picture not be written there.
     """
-    console = console or Console()
+    console = console or new_console()
     if options.png is not None and options.png.suffix.lower() != ".png":
         raise FieldError("png", f"{options.png}", "a file name that ends in .png")
     spec = load_profile("arenas", options.name, ArenaSpec)
@@ -104,5 +105,5 @@ def run(options: ArenaOptions, console: Console | None = None) -> int:
         except OSError as error:
             problem = f"cannot write: {error.strerror}"
             raise FieldError("png", f"{options.png}", problem=problem) from None
-        console.print(f"picture: {options.png}", soft_wrap=True, markup=False, highlight=False)
+        console.print(f"picture: {options.png}", soft_wrap=True, highlight=False)
     return 0

@@ -8,6 +8,7 @@ import threading
 from rich.console import Console
 
 from airl_mav.cli.options import run_command
+from airl_mav.core.console import new_console
 from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED
 from airl_mav.core.files import save_arrays
 from airl_mav.scenario.stand_alone import StandAloneCompanion
@@ -40,7 +41,7 @@ def run(options: CompanionOptions, console: Console | None = None) -> int:
 
     Exit status: 0 the goal was reached, 1 it was not, 130 Ctrl-C.
     """
-    console = console or Console(soft_wrap=True)
+    console = console or new_console(soft_wrap=True)
     mission = prepare(options)
     stop, abandon, interrupted = threading.Event(), threading.Event(), threading.Event()
 
@@ -55,7 +56,7 @@ def run(options: CompanionOptions, console: Console | None = None) -> int:
     what = "simulator" if options.lockstep else "flight controller"
 
     def waiting() -> None:
-        console.print(f"waiting for a {what} on {options.connect}", markup=False)
+        console.print(f"waiting for a {what} on {options.connect}")
         manager.tell(READY="1", STATUS=f"waiting for a {what} on {options.connect}")
 
     def progress(phase: str, time_us: int) -> None:
@@ -74,15 +75,15 @@ def run(options: CompanionOptions, console: Console | None = None) -> int:
                 result = fly_alone(options, mission, stop, abandon, waiting, progress)
             manager.tell(STATUS=result.reason)
     except (LinkError, Abandoned) as error:
-        console.print(f"error: {error}", style="red", markup=False)
+        console.print(f"error: {error}", style="red")
         return EXIT_INTERRUPTED if interrupted.is_set() else EXIT_BROKEN
     for name, digest in sha256.items():
         console.print(f"{name:<13} {digest}", highlight=False)
     if options.log is not None:
         save_arrays(options.log, result.log.columns())
     for note in result.notes:
-        console.print(note, style="yellow", markup=False)
-    console.print(f"{result.reason}; {len(result.log)} decisions", markup=False)
+        console.print(note, style="yellow")
+    console.print(f"{result.reason}; {len(result.log)} decisions")
     if result.reason == "goal reached":
         return 0
     return EXIT_INTERRUPTED if interrupted.is_set() else EXIT_BROKEN
@@ -92,12 +93,12 @@ def show_check(
     options: CompanionOptions, mission: Mission, stop: threading.Event, console: Console
 ) -> int:
     """Say what is found on the ground, line by line; exit status 0 all is good, 1 it is not."""
-    console.print(f"looking at {options.camera} and {options.connect}", markup=False)
+    console.print(f"looking at {options.camera} and {options.connect}")
     good = True
     for finding in check_on_ground(options, mission, stop):
         good &= finding.good
         mark, colour = ("ok", "green") if finding.good else ("WRONG", "red")
-        console.print(f"{finding.what:<18} {mark:<6} {finding.told}", style=colour, markup=False)
+        console.print(f"{finding.what:<18} {mark:<6} {finding.told}", style=colour)
     return 0 if good and not stop.is_set() else EXIT_BROKEN
 
 

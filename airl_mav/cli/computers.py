@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from airl_mav.cli.options import POSITIONAL
+from airl_mav.core.console import new_console
 from airl_mav.core.fields import ProfileModel
 from airl_mav.profiles.computer import Latency, Workload, load_computer
 from airl_mav.profiles.loading import list_profiles
@@ -41,10 +42,10 @@ OPTIONS = ComputersOptions
 
 def run(options: ComputersOptions, console: Console | None = None) -> int:
     """Print the table. Returns exit status 0; raises UsageError for a profile that is none."""
-    console = console or Console()
+    console = console or new_console()
     names = options.profiles or tuple(list_profiles("computers"))
     console.print(_table(names))
-    console.print(SAYS, markup=False, highlight=False)
+    console.print(SAYS, highlight=False)
     return 0
 
 

@@ -8,6 +8,7 @@ from typing import Any
 from pydantic import BaseModel, Field
 from rich.console import Console
 
+from airl_mav.core.console import new_console
 from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED, FieldError
 from airl_mav.rehearsal.signals import terminated_as_interrupted
 
@@ -80,7 +81,7 @@ def run(options: ConformanceOptions, console: Console | None = None) -> int:
     from airl_mav.conformance.run import check_conformance
     from airl_mav.conformance.steps import STEP_NAMES
 
-    console = console or Console()
+    console = console or new_console()
     if options.out is not None and not options.out.parent.is_dir():
         raise FieldError("out", str(options.out), problem=f"no folder {options.out.parent}")
     if options.skip_steps and (options.steps_only or options.steps):
@@ -105,7 +106,7 @@ def run(options: ConformanceOptions, console: Console | None = None) -> int:
         console.print(step_table(result, result.reference))
     console.print(check_table(result))
     style = "bold green" if result.passed else "bold red"
-    console.print(result.verdict, style=style, markup=False, soft_wrap=True)
+    console.print(result.verdict, style=style, soft_wrap=True)
     if options.out is not None:
         result.write(options.out)
     if result.interrupted:

@@ -116,7 +116,7 @@ def _show(flown: FlownRun, gate: Gate, requirements: Sequence[Requirement], voic
     """Print the tables and write the report of one run; return the exit status."""
     code = EXIT_CODES[flown.ended]
     if not flown.episodes:
-        voice.console.print(f"no episode was finished; {flown.path}", soft_wrap=True, markup=False)
+        voice.console.print(f"no episode was finished; {flown.path}", soft_wrap=True)
         voice.finish(code, flown.ended, flown.path)
         return code
     loaded = load(flown.path)

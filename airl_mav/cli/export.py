@@ -12,6 +12,7 @@ from pydantic import Field
 from rich.console import Console
 
 from airl_mav.cli.options import POSITIONAL
+from airl_mav.core.console import new_console
 from airl_mav.core.errors import FieldError
 from airl_mav.experiments.quantisation import export_int8
 from airl_mav.policy.card import CARD_FILE, ONNX_FILE, PolicyCard
@@ -62,7 +63,7 @@ def run(options: ExportOptions, console: Console | None = None) -> int:
 
     Nothing was written then.
     """
-    console = console or Console()
+    console = console or new_console()
     if options.int8:
         card = _export_int8(options)
     elif (
@@ -79,7 +80,7 @@ def run(options: ExportOptions, console: Console | None = None) -> int:
         f"{options.out / CARD_FILE}  {card.parameters:,} parameters, "
         f"{card.macs:,} multiply-accumulates, SHA-256 {card.sha256[:12]}...",
     ):
-        console.print(line, soft_wrap=True, markup=False, highlight=False)
+        console.print(line, soft_wrap=True, highlight=False)
     if (made := card.quantisation) is not None:
         same = "" if made.agreement is None else f"{100.0 * made.agreement:.1f} % of actions same, "
         console.print(

@@ -10,6 +10,7 @@ from rich.console import Console
 
 from airl_mav.cli.options import POSITIONAL, check_installed
 from airl_mav.cli.recordings import folder_of
+from airl_mav.core.console import new_console
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.ports import LOOPBACK
@@ -65,7 +66,7 @@ def run(options: ExportLogOptions, console: Console | None = None) -> int:
     Raises UsageError for a folder that holds no run, a flight that is not there, what is not
     installed, a folder that cannot be made, or a taken port.
     """
-    console = console or Console()
+    console = console or new_console()
     if options.stream or options.format == "mcap":
         check_installed("export")
     folder = folder_of(options.run)

@@ -10,6 +10,7 @@ from pydantic import Field
 from rich.console import Console
 
 from airl_mav.core.clock import utc_now
+from airl_mav.core.console import new_console
 from airl_mav.core.errors import EXIT_NOT_MET, FieldError
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.files import replace_file
@@ -89,7 +90,7 @@ def run(options: FaultsOptions, console: Console | None = None) -> int:
     Raises:
         UsageError: A fault, a phase or the vehicle cannot be flown.
     """
-    console = console or Console()
+    console = console or new_console()
     phases = tuple(_phase(name) for name in options.phases)
     faults = [_without_time(fault) for fault in options.faults] or [c.fault for c in CASES]
     seeds = range(options.seed, options.seed + options.episodes)
@@ -114,7 +115,7 @@ def run(options: FaultsOptions, console: Console | None = None) -> int:
         bar.close()
     replace_file(out / "faults.md", markdown(cells).encode())
     print_table(table_of(faults, phases, cells), console, wrap=True)
-    console.print(f"{out}", soft_wrap=True, markup=False)
+    console.print(f"{out}", soft_wrap=True)
     return EXIT_NOT_MET if any(cell.unexpected for cell in cells) else 0
 
 

@@ -8,6 +8,7 @@ import threading
 from rich.console import Console
 
 from airl_mav.cli.options import run_command
+from airl_mav.core.console import new_console
 from airl_mav.core.errors import EXIT_BROKEN
 from airl_mav.lockstep.remote import fly_vehicle_in_lockstep
 from airl_mav.lockstep.turns import LockstepError
@@ -37,7 +38,7 @@ def run(options: FirmwareOptions, console: Console | None = None) -> int:
 
     Exit status: 0, or 1 when real firmware or the companion in lockstep was lost.
     """
-    console = console or Console(soft_wrap=True)
+    console = console or new_console(soft_wrap=True)
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
@@ -45,14 +46,14 @@ def run(options: FirmwareOptions, console: Console | None = None) -> int:
     try:
         fly(options, stop, _listener(options, console))
     except (FirmwareLostError, LockstepError) as error:
-        console.print(f"error: {error}", style="red", markup=False)
+        console.print(f"error: {error}", style="red")
         return EXIT_BROKEN
     return 0
 
 
 def _listener(options: FirmwareOptions, console: Console) -> Listener:
     def say(line: str) -> None:
-        console.print(line, markup=False, highlight=False)
+        console.print(line, highlight=False)
 
     def ready(camera: str, goal: tuple[float, float]) -> None:
         say(f"MAVSDK            udpin://{options.companion_host}:{options.companion_port}")

@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from airl_mav.cli.options import POSITIONAL
+from airl_mav.core.console import new_console
 from airl_mav.core.plugins import POLICIES, announced
 from airl_mav.policy.registry import find_policy, policy_names
 from airl_mav.profiles.loading import Kind, describe_profile, list_profiles
@@ -50,7 +51,7 @@ OPTIONS = ListOptions
 
 def run(options: ListOptions, console: Console | None = None) -> int:
     """Print the names with one line about each. Returns exit status 0."""
-    console = console or Console()
+    console = console or new_console()
     for kind in KINDS if options.kind == "all" else (options.kind,):
         table = Table(title=kind, title_justify="left", box=None, show_header=False)
         for name, description in KINDS[kind]():

@@ -12,6 +12,7 @@ from rich.table import Table
 
 from airl_mav import __version__
 from airl_mav.cli.options import run_command
+from airl_mav.core.console import new_console
 from airl_mav.core.errors import EXIT_USAGE
 
 SUBCOMMANDS: dict[str, str] = {
@@ -52,7 +53,7 @@ MODULES = {"export-log": "airl_mav.cli.export_log", "list": "airl_mav.cli.listin
 def main(words: Sequence[str] | None = None) -> NoReturn:
     """Run a subcommand and exit with its status."""
     words = sys.argv[1:] if words is None else words
-    console = Console(soft_wrap=True)
+    console = new_console(soft_wrap=True)
     if not words or words[0] in ("-h", "--help"):
         _print_help(console)
         sys.exit(0 if words else EXIT_USAGE)
@@ -63,8 +64,8 @@ def main(words: Sequence[str] | None = None) -> NoReturn:
     if name not in SUBCOMMANDS:
         near = difflib.get_close_matches(name, SUBCOMMANDS, n=1)
         hint = f"did you mean {near[0]}?" if near else f"accepted: {', '.join(SUBCOMMANDS)}"
-        Console(stderr=True, soft_wrap=True).print(
-            f"error: airl {name}: no such command; {hint}", style="red", markup=False
+        new_console(stderr=True, soft_wrap=True).print(
+            f"error: airl {name}: no such command; {hint}", style="red"
         )
         sys.exit(EXIT_USAGE)
     run_command(f"airl {name}", MODULES.get(name, f"airl_mav.cli.{name}"), rest)

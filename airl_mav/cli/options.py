@@ -22,8 +22,8 @@ from typing import Annotated, Any, NoReturn, TypeVar, get_args
 import tyro
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
-from rich.console import Console
 
+from airl_mav.core.console import new_console
 from airl_mav.core.errors import (
     EXIT_BROKEN,
     EXIT_INTERRUPTED,
@@ -177,8 +177,8 @@ def _with_new_names(words: Sequence[str], renamed: Mapping[str, tuple[str, ...]]
             out.append(word)
             continue
         new = renamed[name]
-        Console(stderr=True, soft_wrap=True).print(
-            f"{name} is called {' '.join(new)} now", style="yellow", markup=False, highlight=False
+        new_console(stderr=True, soft_wrap=True).print(
+            f"{name} is called {' '.join(new)} now", style="yellow", highlight=False
         )
         out += [*new[:-1], f"{new[-1]}{equals}{value}"]
     return out
@@ -345,7 +345,7 @@ def _thread_failed(failed: threading.ExceptHookArgs) -> None:
 
 
 def _fail(message: str) -> None:
-    Console(stderr=True, soft_wrap=True).print(f"error: {message}", style="red", markup=False)
+    new_console(stderr=True, soft_wrap=True).print(f"error: {message}", style="red")
 
 
 EXTRAS = {

@@ -10,6 +10,7 @@ from pydantic import Field, field_validator
 from rich.console import Console
 
 from airl_mav.cli.options import POSITIONAL, RENAMED, check_installed
+from airl_mav.core.console import new_console
 from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED, FieldError
 from airl_mav.core.progress import RichProgress
 from airl_mav.profiling.measurement import ProfilingError, share
@@ -61,7 +62,7 @@ def run(options: ProfileOptions, console: Console | None = None) -> int:
     Exit status: 0 measured, 1 it broke off, 130 Ctrl-C. Only with 0 is anything written, and with
     130 where Ctrl-C ended the soak.
     """
-    console = console or Console()
+    console = console or new_console()
     if options.level == "sitl":
         check_installed("sim")
     if options.network is not None:

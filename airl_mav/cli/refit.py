@@ -9,6 +9,7 @@ from pydantic import Field
 from rich.console import Console
 
 from airl_mav.cli.options import POSITIONAL, check_installed
+from airl_mav.core.console import new_console
 from airl_mav.core.fields import ProfileModel
 from airl_mav.report.table import NONE, Column, TableView, print_table
 
@@ -53,7 +54,7 @@ OPTIONS = RefitOptions
 
 def run(options: RefitOptions, console: Console | None = None) -> int:
     """Refit. Returns exit status 0; raises UsageError as `refit` does."""
-    console = console or Console()
+    console = console or new_console()
     check_installed("sim", "refit")
     # Imported here: MCAP and pyulog are extras.
     from airl_mav.refitting.refit import refit
@@ -67,7 +68,7 @@ def run(options: RefitOptions, console: Console | None = None) -> int:
     )
     print_table(table_of(found), console)
     for line in (*unobserved_lines(found), *found.notes, f"written: {options.out}"):
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
+        console.print(line, highlight=False, soft_wrap=True)
     return 0
 
 

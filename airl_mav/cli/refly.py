@@ -12,6 +12,7 @@ from rich.console import Console
 
 from airl_mav.cli.options import POSITIONAL, check_installed
 from airl_mav.core.clock import utc_now
+from airl_mav.core.console import new_console
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.report.comparison.runs import compare_folders
@@ -97,7 +98,7 @@ OPTIONS = ReflyOptions
 
 def run(options: ReflyOptions, console: Console | None = None) -> int:
     """Rehearse the flight. Returns exit status 0; raises UsageError as `refly` does."""
-    console = console or Console()
+    console = console or new_console()
     check_installed("black-box", "sim")
     _check(options)
     # Imported here: MCAP is an extra.
@@ -124,7 +125,7 @@ def run(options: ReflyOptions, console: Console | None = None) -> int:
     show_comparison(comparison, runs, out, console)
     console.print()
     for sentence in found.sentences:
-        console.print(sentence, markup=False)
+        console.print(sentence)
     if parts:
         print_table(parts_table(parts, found.flown_s), console)
     return 0

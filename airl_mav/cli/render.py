@@ -15,6 +15,7 @@ from airl_mav.black_box.messages import SUFFIX
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.cli.options import POSITIONAL, check_installed
 from airl_mav.cli.recordings import folder_of
+from airl_mav.core.console import new_console
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity
@@ -140,7 +141,7 @@ def run(options: RenderOptions, console: Console | None = None) -> int:
         UsageError: An option does not go with the subject, the arena cannot be made, the run not be
             read, the renderer cannot draw it, or the file not be written there.
     """
-    console = console or Console()
+    console = console or new_console()
     path = Path(options.subject)
     filmed = path.is_dir() or path.suffix == SUFFIX
     _check(options, filmed)

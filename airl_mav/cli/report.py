@@ -12,6 +12,7 @@ from airl_mav.black_box.messages import SUFFIX
 from airl_mav.cli.options import POSITIONAL
 from airl_mav.cli.recordings import folder_of
 from airl_mav.core.clock import utc_now
+from airl_mav.core.console import new_console
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel
 from airl_mav.rehearsal.run_folder import RUN_FILE, load
@@ -70,7 +71,7 @@ def run(options: ReportOptions, console: Console | None = None) -> int:
     Raises UsageError for a folder that holds nothing to report or whose arenas cannot be made any
     more, and for runs that cannot be compared.
     """
-    console = console or Console()
+    console = console or new_console()
     if not options.runs:
         raise FieldError("runs", accepted="one run folder or more")
     recorded = [path for path in options.runs if path.suffix == SUFFIX and not path.is_dir()]

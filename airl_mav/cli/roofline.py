@@ -7,6 +7,7 @@ from pathlib import Path
 from pydantic import Field
 from rich.console import Console
 
+from airl_mav.core.console import new_console
 from airl_mav.experiments.roofline import RooflineRequest, roofline
 from airl_mav.report.document import print_document
 
@@ -37,5 +38,5 @@ def run(options: RooflineOptions, console: Console | None = None) -> int:
     """Work out and fly the roofline, and show it; 0. Raises UsageError as `roofline`."""
     asked = {name: getattr(options, name) for name in RooflineRequest.model_fields}
     result = roofline(RooflineRequest(**asked), out=options.out)
-    print_document(result.document, console or Console(), result.page)
+    print_document(result.document, console or new_console(), result.page)
     return 0

@@ -118,7 +118,7 @@ def _announce(scenario: ResolvedScenario, console: Console) -> None:
 
 
 def _say(console: Console, text: str) -> None:
-    console.print(text, soft_wrap=True, markup=False, highlight=False)
+    console.print(text, soft_wrap=True, highlight=False)
 
 
 if __name__ == "__main__":

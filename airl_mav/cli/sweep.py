@@ -10,6 +10,7 @@ from pydantic import Field
 from rich.console import Console
 
 from airl_mav.cli.options import POSITIONAL, check_installed
+from airl_mav.core.console import new_console
 from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED, FieldError
 from airl_mav.core.progress import RichProgress
 from airl_mav.experiments.open_executor import open_executor
@@ -46,7 +47,7 @@ def run(options: SweepOptions, console: Console | None = None) -> int:
 
     Exit status: 0 all trials ended, 1 a trial cannot be carried out, 130 Ctrl-C.
     """
-    console = console or Console()
+    console = console or new_console()
     config, settings = options.config(), options.executor_settings()
     _check_device(options)
     computer, path = options.for_computer(), options.path

@@ -13,6 +13,7 @@ from rich.console import Console
 
 from airl_mav import __version__
 from airl_mav.core.clock import utc_now
+from airl_mav.core.console import new_console
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel
 from airl_mav.core.json_progress import JsonProgress
@@ -110,12 +111,12 @@ class Voice:
         """
         if options.quiet and options.json_lines:
             raise FieldError("quiet", True, problem="accepted: without --json")
-        self._out = console or Console()
+        self._out = console or new_console()
         self._json = JsonProgress(self._out.file) if options.json_lines else None
         self._quiet = options.quiet
         self._command = command
         silent = options.quiet or options.json_lines
-        self.console = Console(quiet=True) if silent else self._out
+        self.console = new_console(quiet=True) if silent else self._out
         """Takes what only a person reads: remarks and tables."""
         self._drawn = None if silent else RichProgress(self._out)
         self.progress: Progress = self._drawn or self._json or _Errors()
@@ -171,11 +172,11 @@ class Voice:
         if not self._quiet:
             return
         for line in (*lines, *more):
-            self._out.print(line, markup=False, highlight=False, soft_wrap=True)
+            self._out.print(line, highlight=False, soft_wrap=True)
         last = f"report  {page}" if page is not None else f"folder  {path}"
         if ended != "complete":
             last = f"{ended}: {path}"
-        self._out.print(last, markup=False, highlight=False, soft_wrap=True)
+        self._out.print(last, highlight=False, soft_wrap=True)
 
 
 def _told(name: str, run: LoadedRun) -> ToldRun:
@@ -201,4 +202,4 @@ class _Errors(Progress):
     def note(self, text: str, style: str | None = None) -> None:
         """Print an error on standard error."""
         if style == "red":
-            Console(stderr=True, soft_wrap=True).print(text, style=style, markup=False)
+            new_console(stderr=True, soft_wrap=True).print(text, style=style)

@@ -58,7 +58,7 @@ def run(
 
     asked = view_of(options)
     voice = Voice(options, "airl train", console)
-    show = partial(voice.console.print, soft_wrap=True, markup=False, highlight=False)
+    show = partial(voice.console.print, soft_wrap=True, highlight=False)
     config = options.configured()
     bound, injections = speed_bound(config.environment), injections_of(config.environment.delay)
     signal.signal(signal.SIGTERM, signal.default_int_handler)

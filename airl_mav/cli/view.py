@@ -12,6 +12,7 @@ from rich.console import Console
 
 from airl_mav.cli.options import POSITIONAL
 from airl_mav.cli.recordings import folder_of
+from airl_mav.core.console import new_console
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.ports import LOOPBACK
@@ -62,7 +63,7 @@ def run(options: ViewOptions, console: Console | None = None) -> int:
 
     Raises UsageError for a folder that holds no run, a flight that is not there, or a taken port.
     """
-    console = console or Console()
+    console = console or new_console()
     paths = [options.run] if options.beside is None else [options.run, options.beside]
     folders = [folder_of(path) for path in paths]
     if options.trust:

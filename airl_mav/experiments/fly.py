@@ -6,8 +6,7 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 
-from rich.console import Console
-
+from airl_mav.core.console import new_console
 from airl_mav.core.progress import Progress, RichProgress
 from airl_mav.experiments.campaign import Cell, run_cell
 from airl_mav.experiments.executors import Executor
@@ -95,7 +94,7 @@ def shown(progress: bool) -> Iterator[Progress]:
     if not progress:
         yield Progress()
         return
-    with RichProgress(Console(stderr=True)) as drawn:
+    with RichProgress(new_console(stderr=True)) as drawn:
         yield drawn
 
 

@@ -18,6 +18,7 @@ from rich.console import Console
 
 from airl_mav.cli.experiments import fly_and_show
 from airl_mav.cli.options import run_command, scenario_of
+from airl_mav.core.console import new_console
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.experiments.experiment import Experiment, make_cell
 from airl_mav.flight.statistics import aggregate
@@ -55,7 +56,7 @@ def declare(scenario: Scenario, title: str) -> Experiment:
 
 
 def run(options: StudyOptions, console: Console | None = None) -> int:
-    console, rows = console or Console(), []
+    console, rows = console or new_console(), []
     with study(options, AblationConfig, __file__) as (config, root):
         for each in config.policies:
             policy = find_or_train(each.policy, root, console, each.training, each.steps)

@@ -25,6 +25,7 @@ from rich.progress import track
 
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.cli.options import run_command, scenario_of
+from airl_mav.core.console import new_console
 from airl_mav.core.errors import FieldError
 from airl_mav.core.files import replace_file
 from airl_mav.core.provenance import provenance
@@ -171,7 +172,7 @@ def cells(flown: dict[int, EpisodeResult], reference: dict[int, EpisodeResult]) 
 
 
 def run(options: StudyOptions, console: Console | None = None) -> int:
-    console = console or Console()
+    console = console or new_console()
     with study(options, CompensationConfig, __file__) as (config, root):
         scenario = scenario_of(config)
         planned = [
@@ -182,7 +183,7 @@ def run(options: StudyOptions, console: Console | None = None) -> int:
         rows = []
         # The commit that flies: another may be checked out before it has flown.
         made = provenance(shlex.join(["python", *sys.argv]))
-        shown = Console(stderr=True)
+        shown = new_console(stderr=True)
         for case in track(planned, "flying", console=shown, disable=not shown.is_terminal):
             flown = fly(scenario, case)
             reference = reference or flown

@@ -16,6 +16,7 @@ from pydantic import Field, create_model
 from rich.console import Console
 
 from airl_mav.cli.options import run_command, scenario_of
+from airl_mav.core.console import new_console
 from airl_mav.experiments.degrade import LATENCIES, declare_degradation
 from airl_mav.experiments.experiment import Experiment
 from airl_mav.scenario.model import Scenario
@@ -35,7 +36,7 @@ def run(options: StudyOptions, console: Console | None = None) -> int:
         def declare(scenario: Scenario) -> Experiment:
             return declare_degradation(scenario, config.latencies, config.policies)
 
-        return fly(declare, scenario_of(config), config.one_goal, root, console or Console())
+        return fly(declare, scenario_of(config), config.one_goal, root, console or new_console())
 
 
 if __name__ == "__main__":

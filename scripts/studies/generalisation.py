@@ -17,6 +17,7 @@ from rich.console import Console
 
 from airl_mav.cli.experiments import fly_and_show
 from airl_mav.cli.options import run_command, scenario_of
+from airl_mav.core.console import new_console
 from airl_mav.experiments.evaluate import matrix
 from airl_mav.experiments.experiment import ExperimentRun, entry_of
 from airl_mav.flight.paired import compare_pairs
@@ -54,7 +55,7 @@ def away_from_home(flown: ExperimentRun) -> TableView:
 
 
 def run(options: StudyOptions, console: Console | None = None) -> int:
-    console = console or Console()
+    console = console or new_console()
     with study(options, GeneralisationConfig, __file__) as (config, root):
         experiment = matrix(scenario_of(config), config.policies, config.arenas)
         code, flown = fly_and_show(experiment, root, console)

@@ -20,6 +20,7 @@ from rich.console import Console
 
 from airl_mav.cli.experiments import fly_and_show
 from airl_mav.cli.options import run_command, scenario_of
+from airl_mav.core.console import new_console
 from airl_mav.core.fields import quantity
 from airl_mav.core.files import replace_file
 from airl_mav.experiments.experiment import Experiment, make_cell
@@ -69,7 +70,7 @@ def train_within(config: HeldOutConfig, arena: str, root: Path, console: Console
 
 
 def run(options: StudyOptions, console: Console | None = None) -> int:
-    console = console or Console()
+    console = console or new_console()
     with study(options, HeldOutConfig, __file__) as (config, root):
         arenas = zones(config, root)
         learned = {

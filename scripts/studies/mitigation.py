@@ -17,6 +17,7 @@ from pydantic import Field, create_model
 from rich.console import Console
 
 from airl_mav.cli.options import run_command, scenario_of
+from airl_mav.core.console import new_console
 from airl_mav.core.fields import quantity
 from airl_mav.experiments.experiment import Experiment
 from airl_mav.experiments.gap import DEFAULT_MITIGATED, DEFAULT_REFERENCE, declare_gap
@@ -36,7 +37,7 @@ class MitigationConfig(StudyConfig):
 
 
 def run(options: StudyOptions, console: Console | None = None) -> int:
-    console = console or Console()
+    console = console or new_console()
     with study(options, MitigationConfig, __file__) as (config, root):
         policy, mitigated = (
             find_or_train(name, root, console, config.training.get(name), config.training_steps)

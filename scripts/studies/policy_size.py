@@ -27,6 +27,7 @@ from size_latency_fit import Fit, fit_times
 
 from airl_mav.cli.options import run_command
 from airl_mav.core.clock import utc_now
+from airl_mav.core.console import new_console
 from airl_mav.core.errors import EXIT_INTERRUPTED, UsageError
 from airl_mav.core.fields import Each, ProfileModel, quantity
 from airl_mav.core.files import replace_file
@@ -118,7 +119,7 @@ class Timed:
 
 
 def run(options: StudyOptions, console: Console | None = None) -> int:
-    console = console or Console()
+    console = console or new_console()
     try:
         study(options, load_profile("sweeps", f"{options.config}", StudyConfig), console)
     except KeyboardInterrupt:

@@ -17,6 +17,7 @@ from rich.console import Console
 
 from airl_mav.cli.experiments import fly_and_show
 from airl_mav.cli.options import run_command, scenario_of
+from airl_mav.core.console import new_console
 from airl_mav.core.errors import UsageError
 from airl_mav.experiments.evaluate import training_arena
 from airl_mav.experiments.experiment import Experiment, make_cell
@@ -45,7 +46,7 @@ def declare(scenario: Scenario, policy: str, integers: Path) -> Experiment:
 
 
 def run(options: StudyOptions, console: Console | None = None) -> int:
-    console = console or Console()
+    console = console or new_console()
     with study(options, QuantisationConfig, __file__) as (config, root):
         for policy in config.policies:
             found, integers = find_policy(policy), root / "policies" / f"{Path(policy).name}-int8"

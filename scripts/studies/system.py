@@ -18,6 +18,7 @@ from pydantic import Field, create_model
 from rich.console import Console
 
 from airl_mav.cli.options import run_command, scenario_of
+from airl_mav.core.console import new_console
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel
 from airl_mav.experiments.experiment import Experiment
@@ -62,7 +63,7 @@ def declare(scenario: Scenario, config: SystemConfig) -> Experiment:
 def run(options: StudyOptions, console: Console | None = None) -> int:
     with study(options, SystemConfig, __file__) as (config, root):
         declared = partial(declare, config=config)
-        return fly(declared, scenario_of(config), config.one_goal, root, console or Console())
+        return fly(declared, scenario_of(config), config.one_goal, root, console or new_console())
 
 
 if __name__ == "__main__":

@@ -1,0 +1,20 @@
+"""Where commands print: rich's console, without its markup.
+
+What is printed are paths, names and messages of others: brackets in them are brackets, not styles,
+and `:name:` is no emoji. Who wants a style gives it by name.
+"""
+
+from __future__ import annotations
+
+from rich.console import Console
+
+
+def new_console(*, stderr: bool = False, quiet: bool = False, soft_wrap: bool = False) -> Console:
+    """Return a console.
+
+    Args:
+        stderr: It writes to standard error, not to standard output.
+        quiet: It writes nothing.
+        soft_wrap: Lines longer than the terminal stay whole.
+    """
+    return Console(stderr=stderr, quiet=quiet, soft_wrap=soft_wrap, markup=False, emoji=False)
