@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -10,9 +9,7 @@ from numpy.typing import NDArray
 
 from airl_mav.camera.frame import MAX_MM, MM_PER_M
 from airl_mav.camera.stereo import Matching, matched_depth, matching_of
-from airl_mav.core.errors import FieldError
 from airl_mav.core.streams import Stream, stream
-from airl_mav.faults.model import Fault
 from airl_mav.profiles.conditions import SensorNoise
 from airl_mav.profiles.vehicle import Camera
 
@@ -33,28 +30,6 @@ def noise_of(camera: Camera, asked: SensorNoise) -> DepthNoise | None:
     matching = matching_of(camera, asked.stereo_noise)
     changed = matching is not None or asked.depth_noise or asked.depth_dropout
     return DepthNoise(matching, asked) if changed else None
-
-
-def check_noise(
-    camera: Camera, asked: SensorNoise, faults: Sequence[Fault], table: str = "sensors"
-) -> None:
-    """Raise FieldError for what makes depths worse, where a camera gives none.
-
-    Args:
-        camera: The camera.
-        asked: Conditions that its images are taken in.
-        faults: What shall fail.
-        table: What `asked` is called.
-    """
-    if camera.kind == "depth":
-        return
-    for name in ("depth_noise", "depth_dropout"):
-        if value := getattr(asked, name):
-            raise FieldError(f"{table}.{name}", value, f"0 with a camera of kind {camera.kind!r}")
-    for fault in faults:
-        if (fault.part, fault.kind) == ("camera", "noise"):
-            accepted = f"a depth camera; the vehicle's is of kind {camera.kind!r}"
-            raise FieldError("faults", str(fault), accepted)
 
 
 def noisy_frame(

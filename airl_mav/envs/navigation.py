@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.camera.conditions import check_noise
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.noise import check_noise
 from airl_mav.core.constants import TICK_US, US_PER_MS, US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.core.streams import Stream, stream

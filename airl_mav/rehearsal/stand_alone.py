@@ -8,7 +8,7 @@ from contextlib import closing
 from dataclasses import dataclass, field
 
 from airl_mav.arena.generate import generate
-from airl_mav.camera.noise import check_noise
+from airl_mav.camera.conditions import check_noise
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loaded import check_spread, equipped
 from airl_mav.profiles.loading import load_profile

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from airl_mav.camera.noise import check_noise
+from airl_mav.camera.conditions import check_noise
 from airl_mav.core.errors import FieldError
 from airl_mav.flight.judge import GOAL_RADIUS_M
 from airl_mav.latency.injection import Injection, without_timing

@@ -1,0 +1,32 @@
+"""Which conditions a camera can take its images in: a light import, so that commands refuse early."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from airl_mav.core.errors import FieldError
+from airl_mav.faults.model import Fault
+from airl_mav.profiles.conditions import SensorNoise
+from airl_mav.profiles.vehicle import Camera
+
+
+def check_noise(
+    camera: Camera, asked: SensorNoise, faults: Sequence[Fault], table: str = "sensors"
+) -> None:
+    """Raise FieldError for what makes depths worse, where a camera gives none.
+
+    Args:
+        camera: The camera.
+        asked: Conditions that its images are taken in.
+        faults: What shall fail.
+        table: What `asked` is called.
+    """
+    if camera.kind == "depth":
+        return
+    for name in ("depth_noise", "depth_dropout"):
+        if value := getattr(asked, name):
+            raise FieldError(f"{table}.{name}", value, f"0 with a camera of kind {camera.kind!r}")
+    for fault in faults:
+        if (fault.part, fault.kind) == ("camera", "noise"):
+            accepted = f"a depth camera; the vehicle's is of kind {camera.kind!r}"
+            raise FieldError("faults", str(fault), accepted)
