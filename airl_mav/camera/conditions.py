@@ -1,4 +1,4 @@
-"""Which conditions a camera can take its images in: a light import, so that commands refuse early."""
+"""What a camera refuses to be asked for: a light import, so that commands can refuse early."""
 
 from __future__ import annotations
 
