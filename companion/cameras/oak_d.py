@@ -7,17 +7,22 @@ profile `quad-oak-d` says: 640 x 400 pixels, disparities up to 95 px in steps of
 from __future__ import annotations
 
 import ipaddress
+import os
 from collections.abc import Callable
 from contextlib import suppress
 from datetime import timedelta
 from typing import Any
 
-import depthai as dai
 import numpy as np
 
 from airl_mav.core.errors import FieldError
 from companion.cameras.driver import FAILED_S, DepthImage, Silence, plausible_age_us
 from companion.cameras.fitting import Lens
+
+# Its crash reporter takes signals over as it is imported. SIGXFSZ is one: where a log reaches a
+# limit of the file's size, the companion would end in flight instead of going on without the log.
+os.environ.setdefault("DEPTHAI_INSTALL_SIGNAL_HANDLER", "0")
+import depthai as dai
 
 RATE_HZ = 30.0
 SIZE_PX = 640, 400

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import queue
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from datetime import timedelta
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,8 +22,10 @@ from companion.cameras.by_name import open_named_camera
 from companion.cameras.driver import CameraThread, DepthImage
 from companion.cameras.fitting import Fitting, Lens
 
-dai = pytest.importorskip("depthai")  # No wheels for all that we run on.
-oak_d = pytest.importorskip("companion.cameras.oak_d")
+oak_d = pytest.importorskip("companion.cameras.oak_d")  # No wheels for all that we run on.
+dai = oak_d.dai
+
+ROOT = Path(__file__).parents[2]
 
 NOW = timedelta(hours=3)
 INTRINSICS = [[441.25, 0.0, 318.0], [0.0, 441.5, 203.0], [0.0, 0.0, 1.0]]
@@ -166,3 +171,24 @@ def test_a_camera_that_is_not_there_is_one_line() -> None:
     for name in ("oak-d", "oak-d:1944301001564D1300"):
         with pytest.raises(FieldError, match=f"{name}.: depthai finds no camera"):
             open_named_camera(name, WallClock(), Intrinsics.from_fov(64, 48, 1.2), "vehicle quad")
+
+
+def test_depthai_takes_no_signals_over(tmp_path: Path) -> None:
+    """A file that may not grow is an error of that file, as without depthai."""
+    code = (
+        "import resource, companion.cameras.oak_d\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (10, 10))\n"
+        "try: open('log', 'wb', buffering=0).write(b'x' * 11) == 10 and open('log', 'ab', "
+        "buffering=0).write(b'x')\n"
+        "except OSError as error: print(error.strerror)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        env={"PYTHONPATH": str(ROOT), "PATH": ""},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert (done.returncode, done.stdout.splitlines()[-1:]) == (0, ["File too large"]), done.stderr
