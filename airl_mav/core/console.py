@@ -6,15 +6,34 @@ and `:name:` is no emoji. Who wants a style gives it by name.
 
 from __future__ import annotations
 
+from typing import IO
+
 from rich.console import Console
 
 
-def new_console(*, stderr: bool = False, quiet: bool = False, soft_wrap: bool = False) -> Console:
+def new_console(
+    *,
+    stderr: bool = False,
+    quiet: bool = False,
+    soft_wrap: bool = False,
+    file: IO[str] | None = None,
+    width: int | None = None,
+) -> Console:
     """Return a console.
 
     Args:
         stderr: It writes to standard error, not to standard output.
         quiet: It writes nothing.
         soft_wrap: Lines longer than the terminal stay whole.
+        file: It writes there instead.
+        width: Columns; None: those of the terminal.
     """
-    return Console(stderr=stderr, quiet=quiet, soft_wrap=soft_wrap, markup=False, emoji=False)
+    return Console(
+        stderr=stderr,
+        quiet=quiet,
+        soft_wrap=soft_wrap,
+        file=file,
+        width=width,
+        markup=False,
+        emoji=False,
+    )

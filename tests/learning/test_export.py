@@ -213,6 +213,7 @@ def test_the_card_tells_what_was_exported(tmp_path: Path) -> None:
         "projection": "pinhole",
         "horizontal_fov_deg": 90.0,
         "range_m": 20.0,
+        "kind": "depth",
         "frames": 1,
         "in_flight": [],
     }

@@ -5,9 +5,8 @@ from __future__ import annotations
 import io
 from typing import Any
 
-from rich.console import Console
-
 from airl_mav.cli.options import carry_out
+from airl_mav.core.console import new_console
 
 
 def airl(name: str, *words: str, width: int | None = None) -> tuple[int, str]:
@@ -16,7 +15,7 @@ def airl(name: str, *words: str, width: int | None = None) -> tuple[int, str]:
     Without a width of the terminal, lines are as long as they are.
     """
     out = io.StringIO()
-    console = Console(file=out, width=width or 200, soft_wrap=width is None)
+    console = new_console(file=out, width=width or 200, soft_wrap=width is None)
     code = carry_out(f"airl {name}", f"airl_mav.cli.{name}", words, console=console)
     return code, out.getvalue()
 
