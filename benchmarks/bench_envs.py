@@ -129,7 +129,7 @@ def measure_ours() -> list[Result]:
 
         same = "the same as a Gymnasium VectorEnv"
         if kind != "depth":
-            same += f", {kind} that the network sees whole"
+            same = f"Gymnasium VectorEnv, {kind}, {WIDTH}x{HEIGHT} to the network"
         name = f"airl-mav, {same}"
         return result(name, CAMERA_STEP_S, 1.0 / TICK_S, *fastest(stretch))
 
