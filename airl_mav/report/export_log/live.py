@@ -19,6 +19,9 @@ PAUSE_US = 2_000_000
 """Between the end of a flight and its next beginning [wall µs]."""
 
 
+SETTLED_S = 0.3
+"""A viewer has subscribed to its topics when no other follows for so long [wall s]."""
+
 BACKLOG = 1024
 """Messages that may wait for a viewer, at least (Foxglove's default); the oldest go first."""
 
@@ -43,7 +46,7 @@ class LiveFlight(ServerListener):
         self._newest: dict[int, tuple[foxglove.Channel, bytes, int]] = {}
         """By the channel's number: channel, message, time [ns]."""
         self._lock = threading.Lock()
-        self._watched = threading.Event()
+        self._watched, self._another = threading.Event(), threading.Event()
         for channel in dict.fromkeys(message.channel for message in self._told):
             self._channels[channel] = self._new(channel)
         try:
@@ -78,6 +81,7 @@ class LiveFlight(ServerListener):
             newest = self._newest.get(channel.id)
             if newest is not None:
                 self._log(*newest)
+        self._another.set()
         self._watched.set()
 
     @staticmethod
@@ -85,8 +89,16 @@ class LiveFlight(ServerListener):
         channel.log(data, log_time=time_ns)
 
     def wait(self, timeout_s: float | None = None) -> bool:
-        """Wait until somebody watches; return whether somebody does."""
-        return self._watched.wait(timeout_s)
+        """Wait until somebody watches all that they want to; return whether somebody does.
+
+        A viewer subscribes to one topic after the other: what is told before the server has taken
+        its subscription is lost on it.
+        """
+        if not self._watched.wait(timeout_s):
+            return False
+        while self._another.wait(SETTLED_S):
+            self._another.clear()
+        return True
 
     def play(self, clock: Clock | None = None) -> None:
         """Publish the flight once, from its beginning to its end."""
