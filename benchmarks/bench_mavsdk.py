@@ -37,6 +37,7 @@ import tyro
 from numpy.typing import NDArray
 from rich.console import Console
 
+from airl_mav.core.ports import LOOPBACK
 from airl_mav.core.provenance import provenance, usable_cores
 from airl_mav.latency.percentiles import summarize
 from airl_mav.profiles.vehicle import load_vehicle
@@ -50,7 +51,6 @@ from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.pacing import WallPacing
 from firmware_sim.simulation import EpisodeSetup
 
-HOST = "127.0.0.1"
 CLIENT = Path(__file__).parent / "latency_client.py"
 READY_S = 8.0
 """Until the vehicle's estimator is ready, and position streams."""
@@ -134,7 +134,7 @@ class TappedEndpoint(UdpEndpoint):
     """The flight controller's socket, with a tap on what comes and goes."""
 
     def __init__(self, remote: Address, tap: Tap) -> None:
-        super().__init__((HOST, 0), remote, local_option="local", remote_option="remote")
+        super().__init__((LOOPBACK, 0), remote, local_option="local", remote_option="remote")
         self._tap = tap
 
     def arrivals(self) -> Iterator[tuple[Peer, bytes]]:
@@ -212,11 +212,13 @@ def main(asked: Bench) -> None:
     ways = {"setpoint": 0, "telemetry": 1}
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        with closing(UdpEndpoint((HOST, 0), None, local_option="", remote_option="")) as free:
+        with closing(UdpEndpoint((LOOPBACK, 0), None, local_option="", remote_option="")) as free:
             port = free.local[1]
         pacing = WallPacing(1.0)
         server = MavlinkServer(
-            [onboard_link(TappedEndpoint((HOST, port), tap))], boot_unix_us=0, clock=pacing.clock
+            [onboard_link(TappedEndpoint((LOOPBACK, port), tap))],
+            boot_unix_us=0,
+            clock=pacing.clock,
         )
         firmware = Firmware(BuiltinFlightStack(server), None, pacing, recording=False)
         stack.enter_context(closing(firmware))

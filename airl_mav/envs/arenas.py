@@ -68,10 +68,14 @@ def with_room(batch: ArenaBatch, arena: Arena) -> ArenaBatch:
     room = batch.shape.shape[1], batch.tour_times_s.shape[1], batch.tour_times_s.shape[2]
     need = _room_of(arena)
     larger = empty_batch(len(batch.bounds), *map(max, room, need))
-    arrays: Iterable[tuple[NDArray[Any], NDArray[Any]]] = zip(batch, larger, strict=True)
-    for old, new in arrays:
-        new[tuple(map(slice, old.shape))] = old
+    copy_rows(batch, larger)
     return larger
+
+
+def copy_rows(batch: Iterable[NDArray[Any]], larger: Iterable[NDArray[Any]]) -> None:
+    """Write arrays into the first places of others that have at least as much room."""
+    for old, new in zip(batch, larger, strict=True):
+        new[tuple(map(slice, old.shape))] = old
 
 
 def _room_of(arena: Arena) -> tuple[int, int, int]:

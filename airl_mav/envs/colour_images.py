@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,7 +16,7 @@ from airl_mav.camera.picture import ColourArrays, write_grey
 from airl_mav.camera.render import Mount, camera_pose
 from airl_mav.camera.textures import atlas
 from airl_mav.core.kernels import kernel
-from airl_mav.envs.arenas import ArenaBatch, move_obstacles
+from airl_mav.envs.arenas import ArenaBatch, copy_rows, move_obstacles
 from airl_mav.envs.fleet import Fleet
 
 
@@ -54,11 +54,7 @@ class Looks:
         room, count = self.batch.texture.shape[1], len(look.texture)
         if count > room:
             larger = _empty(len(self.batch.texture), count)
-            arrays: Iterable[tuple[NDArray[Any], NDArray[Any]]] = zip(
-                self.batch, larger, strict=True
-            )
-            for old, new in arrays:
-                new[tuple(map(slice, old.shape))] = old
+            copy_rows(self.batch, larger)
             self.batch = larger
         batch = self.batch
         batch.lights[i] = look.lights

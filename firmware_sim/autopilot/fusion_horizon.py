@@ -14,15 +14,13 @@ from collections import deque
 
 import numpy as np
 
-from airl_mav.core.constants import TICK_US
+from airl_mav.core.constants import TICK_US, US_PER_MS
 from airl_mav.core.frames import Vector
 from firmware_sim.autopilot.error_state import P, Q
 
 SIMULATED_MS = 10.0
 """EKF2_GPS_DELAY by default: what a fix takes on its way through PX4's simulators. Here it takes
 nothing, so that only what is assumed beyond it counts [ms]."""
-
-_US_PER_MS = 1000.0
 
 
 class FusionHorizon:
@@ -37,7 +35,7 @@ class FusionHorizon:
 
     def assume(self, delay_ms: float) -> None:
         """Put it so far back as fixes are assumed to be late: EKF2_GPS_DELAY [ms]."""
-        late_us = (delay_ms - SIMULATED_MS) * _US_PER_MS
+        late_us = (delay_ms - SIMULATED_MS) * US_PER_MS
         length = 1 + max(0, round(late_us / TICK_US))
         if length != self._log.maxlen:
             self._log = deque([self._travelled], maxlen=length)

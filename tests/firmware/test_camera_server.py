@@ -24,7 +24,7 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import quat_from_euler
 from airl_mav.profiles.camera_kind import CameraKind
 from airl_mav.profiles.vehicle import load_vehicle
-from companion.camera import MESSAGES_PER_LOOK, ZmqFrameSource
+from companion.camera import MESSAGES_PER_LOOK, ReceivedFrame, ZmqFrameSource
 from firmware_sim.plant.camera_server import CameraServer, SimulatedCamera
 from tests.support.flight_rig import quad
 
@@ -126,12 +126,14 @@ def test_moving_obstacle_is_seen_where_it_is_now() -> None:
 # --- the wire ------------------------------------------------------------------------------------
 
 
-def connected(server: CameraServer, source: ZmqFrameSource) -> None:
-    """Publish frame 0 until the subscription has reached the server."""
+def connected(
+    server: CameraServer, source: ZmqFrameSource, sent: Frame | None = None
+) -> ReceivedFrame:
+    """Publish a frame, number 0 by default, until it arrives; return what did."""
     for _ in range(1000):
-        server.publish(frame(0))
-        if source.wait(-1, 0.02) is not None:
-            return
+        server.publish(sent or frame(0))
+        if (received := source.wait(-1, 0.02)) is not None:
+            return received
     raise AssertionError("the subscriber never got a frame")
 
 
@@ -166,12 +168,7 @@ def test_a_panorama_arrives_whole() -> None:
     server = CameraServer(LOOPBACK)
     source = ZmqFrameSource(server.endpoint, SimClock())
     try:
-        received = None
-        for _ in range(1000):
-            server.publish(sent)
-            if (received := source.wait(-1, 0.02)) is not None:
-                break
-        assert received is not None
+        received = connected(server, source, sent)
         assert received.frame.intrinsics == sent.intrinsics == Intrinsics.of(profile)
         np.testing.assert_array_equal(received.frame.depth_mm, sent.depth_mm)
         assert np.all(sent.depth_mm[19] > 0)  # walls all round, and the pillar behind
@@ -190,12 +187,7 @@ def test_colours_arrive_whole(kind: CameraKind) -> None:
     server = CameraServer(LOOPBACK)
     source = ZmqFrameSource(server.endpoint, SimClock())
     try:
-        received = None
-        for _ in range(1000):
-            server.publish(sent)
-            if (received := source.wait(-1, 0.02)) is not None:
-                break
-        assert received is not None
+        received = connected(server, source, sent)
         assert received.frame.intrinsics == sent.intrinsics == Intrinsics.of(profile)
         np.testing.assert_array_equal(received.frame.image, sent.image)
         where, level = (profile.forward_m, 0.0, -2.0 - profile.up_m), (1.0, 0.0, 0.0, 0.0)

@@ -9,9 +9,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from airl_mav.core.constants import US_PER_MS
 from firmware_sim.autopilot.esc import current_a
-
-_US_PER_MS = 1000
 
 
 class Undercurrent(NamedTuple):
@@ -54,7 +53,7 @@ class MotorFailure:
             if not (throttle > limits.throttle and current_a(output) < least_a):
                 self._since_us.pop(motor, None)
             elif time_us - self._since_us.setdefault(motor, time_us) > (
-                limits.lasting_ms * _US_PER_MS
+                limits.lasting_ms * US_PER_MS
             ):
                 self.failed = True
 
