@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import numpy as np
 
 from airl_mav.arena.footprints import Boxes, Floats, draw_points, inner, outside, with_room
@@ -49,16 +51,48 @@ def draw_place(
     Returns:
         Whether there was one within TRIES tries.
     """
-    lowest, highest = low + (half + gap_m), high - (half + gap_m)
-    if lowest[0] > highest[0] or lowest[1] > highest[1]:
+    if not _fits(half, low, high, gap_m):
         return False
-    points, span, grown = np.empty((BATCH, 2)), highest - lowest, taken + half
+    numbers, origin, square = np.empty((BATCH, 2)), np.zeros(2), np.ones(2)
     for _ in range(BATCHES):
-        draw_points(rng, lowest, span, points)
-        for point in points:
-            if outside(point, center, grown):
-                place[:] = point
-                return True
+        draw_points(rng, origin, square, numbers)
+        if _first_free(numbers, half, center, taken, low, high, gap_m, place):
+            return True
+    return False
+
+
+@kernel
+def _fits(half: Floats, low: Floats, high: Floats, gap_m: float) -> bool:
+    """Return whether a box, `gap_m` away from the walls, is no larger than the floor."""
+    for axis in range(2):
+        margin = half[axis] + gap_m
+        if low[axis] + margin > high[axis] - margin:
+            return False
+    return True
+
+
+@kernel
+def _first_free(
+    numbers: Floats,
+    half: Floats,
+    center: Floats,
+    taken: Floats,
+    low: Floats,
+    high: Floats,
+    gap_m: float,
+    place: Floats,
+) -> bool:
+    """Write the first free one of the places that `numbers` (k, 2), uniform in [0, 1), stand for.
+
+    The other arguments are those of `draw_place`, and so is what is returned.
+    """
+    lowest, highest = low + (half + gap_m), high - (half + gap_m)
+    span, grown = highest - lowest, taken + half
+    for number in numbers:
+        for axis in range(2):
+            place[axis] = lowest[axis] + span[axis] * number[axis]
+        if outside(place, center, grown):
+            return True
     return False
 
 
@@ -79,7 +113,16 @@ def place_all(
     """
     n, boxes = len(halves), with_room(keep_off, halves + gap_m)
     low, high = inner(bounds, 0.0)
-    placed = _place_all(rng, halves, boxes.center, boxes.half, low, high, gap_m)
+    placed, tried = 0, 0
+    while placed < n and tried < BATCHES:
+        # Drawn here: numba needs longer to take a generator than numpy to draw all of them. Each
+        # that has no place yet needs a batch at least.
+        batches = rng.random((n - placed, BATCH, 2))
+        placed, tried, used = _place_all(
+            batches, halves, boxes.center, boxes.half, low, high, gap_m, placed, tried
+        )
+        if used < len(batches):
+            _give_back(rng, batches[used:].size)
     if placed < n:
         raise NoRoomError(f"{placed} of {n} placed", placed)
     return boxes.center[len(keep_off) :]
@@ -87,18 +130,51 @@ def place_all(
 
 @kernel
 def _place_all(
-    rng: np.random.Generator,
+    batches: Floats,
     halves: Floats,
     center: Floats,
     half: Floats,
     low: Floats,
     high: Floats,
     gap_m: float,
-) -> int:
-    """Place boxes one by one, into the last rows of `center`; return how many found room."""
-    n = len(halves)
-    for i in range(n):
-        at = len(center) - n + i
-        if not draw_place(rng, halves[i], center[:at], half[:at], low, high, gap_m, center[at]):
-            return i
-    return n
+    placed: int,
+    tried: int,
+) -> tuple[int, int, int]:
+    """Place boxes one by one, into the last rows of `center`, while there are numbers.
+
+    Args:
+        batches: (k, BATCH, 2) uniform in [0, 1), for one try of a box each.
+        halves: As of `place_all`, and so is `gap_m`.
+        center: Centres of what they must not overlap, and of themselves [m].
+        half: Half extents of these, any clearance already added [m].
+        low: As of `draw_place`, and so is `high`.
+        high: See there.
+        gap_m: See there.
+        placed: How many boxes have a place.
+        tried: How many batches the next one has been tried with.
+
+    Returns:
+        `placed` and `tried` now, at most BATCHES, and how many of the batches were used.
+    """
+    n, used = len(halves), 0
+    while placed < n and tried < BATCHES and used < len(batches):
+        i, at = placed, len(center) - n + placed
+        if not _fits(halves[i], low, high, gap_m):
+            return placed, BATCHES, used
+        used += 1
+        if _first_free(
+            batches[used - 1], halves[i], center[:at], half[:at], low, high, gap_m, center[at]
+        ):
+            placed, tried = placed + 1, 0
+        else:
+            tried += 1
+    return placed, tried, used
+
+
+def _give_back(rng: np.random.Generator, count: int) -> None:
+    """Let a generator draw its last `count` uniform numbers once more."""
+    bits = cast(np.random.PCG64, rng.bit_generator)
+    # Half of a number may wait to be drawn as a whole number; `advance` forgets it.
+    waiting = bits.state
+    bits.advance(-count)
+    bits.state = {**waiting, "state": bits.state["state"]}

@@ -77,11 +77,12 @@ def draw_tours(
         kind.dwell_s,
         kind.tour_min_s,
     )
-    ends = np.cumsum(counts).tolist()
     way = points.tolist()
+    # One too many between two tours; not the kernel's hypot, whose last bit is the platform's.
+    legs = np.fromiter(map(math.dist, way, way[1:]), np.float64)
+    times, places, ends = _timed(points, counts, speeds, legs, kind.dwell_s)
     return [
-        _timed(way[end - count : end], speed, kind.dwell_s)
-        for end, count, speed in zip(ends, counts.tolist(), speeds.tolist(), strict=True)
+        Tour(times[begin:end], places[begin:end]) for begin, end in pairwise((0, *ends.tolist()))
     ]
 
 
@@ -228,14 +229,33 @@ def _draw_waypoint(
     return False
 
 
-def _timed(points: list[list[float]], speed: float, dwell_s: float) -> Tour:
-    """Return the tour through `points` at constant speed, with a stop at each but the first."""
-    times = [0.0]
-    places = [points[0]]
-    for here, there in pairwise(points):
-        times.append(times[-1] + math.dist(here, there) / speed)
-        places.append(there)
-        if dwell_s > 0.0:
-            times.append(times[-1] + dwell_s)
-            places.append(there)
-    return Tour(np.array(times), np.array(places))
+@kernel
+def _timed(
+    points: Floats, counts: NDArray[np.int64], speeds: Floats, legs: Floats, dwell_s: float
+) -> tuple[Floats, Floats, NDArray[np.int64]]:
+    """Time the tours at constant speeds, with a stop at each point but the first.
+
+    Args:
+        points: (k, 2) way-points of all tours, one tour after the other [m].
+        counts: (m,) how many each has.
+        speeds: (m,) of each [m/s].
+        legs: (k - 1,) length of the way from each point to the next [m].
+        dwell_s: How long a stop lasts; 0: there is none.
+
+    Returns:
+        Times [s] and places [m] of all tours, and where in them each ends.
+    """
+    stops = 1 if dwell_s > 0.0 else 0
+    times, places = np.empty(len(points) * (1 + stops)), np.empty((len(points) * (1 + stops), 2))
+    ends, first, at = np.empty(len(counts), np.int64), 0, 0
+    for i in range(len(counts)):
+        times[at], places[at] = 0.0, points[first]
+        for k in range(first + 1, first + counts[i]):
+            times[at + 1], places[at + 1] = times[at] + legs[k - 1] / speeds[i], points[k]
+            at += 1
+            if stops:
+                times[at + 1], places[at + 1] = times[at] + dwell_s, points[k]
+                at += 1
+        at, first = at + 1, first + counts[i]
+        ends[i] = at
+    return times, places, ends

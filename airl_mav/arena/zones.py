@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from airl_mav.arena.footprints import Boxes, Floats, draw_points, inner, outside
+from airl_mav.arena.footprints import Boxes, Floats, inner, outside
 from airl_mav.arena.geometry import Bounds
 from airl_mav.arena.placement import BATCH, BATCHES
 from airl_mav.core.errors import FieldError
@@ -59,15 +59,18 @@ def draw_goal(
     low, high = np.maximum(low, -farthest), np.minimum(high, farthest)
     if (low > high).any():
         return None
-    goal = np.empty(2)
-    if _find_goal(rng, low, high - low, nearest, farthest, keep_off.center, keep_off.half, goal):
-        return goal
+    goal, span = np.empty(2), high - low
+    for _ in range(BATCHES):
+        # Drawn here: numba needs longer to take a generator than numpy to draw all of them.
+        numbers = rng.random((BATCH, 2))
+        if _find_goal(numbers, low, span, nearest, farthest, keep_off.center, keep_off.half, goal):
+            return goal
     return None
 
 
 @kernel
 def _find_goal(
-    rng: np.random.Generator,
+    numbers: Floats,
     low: Floats,
     span: Floats,
     nearest: float,
@@ -76,13 +79,14 @@ def _find_goal(
     half: Floats,
     goal: Floats,
 ) -> bool:
-    """Write the first point that is drawn within the ring, outside all boxes."""
-    points = np.empty((BATCH, 2))
-    for _ in range(BATCHES):
-        draw_points(rng, low, span, points)
-        for point in points:
-            distance = math.hypot(point[0], point[1])
-            if nearest <= distance <= farthest and outside(point, center, half):
-                goal[:] = point
-                return True
+    """Write the first point within the ring, outside all boxes.
+
+    Of those that `numbers` (n, 2), uniform in [0, 1), stand for.
+    """
+    for number in numbers:
+        for axis in range(2):
+            goal[axis] = low[axis] + span[axis] * number[axis]
+        distance = math.hypot(goal[0], goal[1])
+        if nearest <= distance <= farthest and outside(goal, center, half):
+            return True
     return False

@@ -21,10 +21,11 @@ from scipy import ndimage, stats
 
 from airl_mav.arena import generate as generate_module
 from airl_mav.arena.draw import draw_arena, save_png
+from airl_mav.arena.footprints import Boxes
 from airl_mav.arena.generate import LAYOUTS, free_area_fraction, generate, local_bounds
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape
 from airl_mav.arena.passage import gaps_suffice, passage_exists, raster_passage
-from airl_mav.arena.placement import place_all
+from airl_mav.arena.placement import BATCH, BATCHES, NoRoomError, place_all
 from airl_mav.arena.tours import set_out_later
 from airl_mav.arena.zones import zone_of, zone_radius_m
 from airl_mav.core.errors import UsageError
@@ -390,6 +391,21 @@ def test_too_dense_is_refused_with_counts_after_bounded_work(
     assert "of 150 static obstacles found a place, none for the next in 2048 tries" in message
     assert "% of the 50 x 50 m floor" in message
     assert "min_clearance_m 2" in message
+
+
+def test_a_layout_given_up_has_drawn_only_what_it_tried() -> None:
+    rngs = np.random.default_rng(5), np.random.default_rng(5)
+    for rng in rngs:
+        # An odd number of whole numbers leaves half a draw behind, which must not be lost.
+        rng.integers(3, size=5)
+    walls = Bounds(north_min=0.0, north_max=10.0, east_min=0.0, east_max=10.0, height=3.0)
+    # The second would have to be where the first is; the third is never tried.
+    halves = np.array([[3.0, 3.0], [3.0, 3.0], [0.1, 0.1]])
+    with pytest.raises(NoRoomError) as caught:
+        place_all(rngs[0], halves, Boxes(np.empty((0, 2)), np.empty((0, 2))), walls, 0.5)
+    assert caught.value.progress == 1
+    rngs[1].random((1 + BATCHES, BATCH, 2))
+    assert rngs[0].bit_generator.state == rngs[1].bit_generator.state
 
 
 @pytest.mark.parametrize(
