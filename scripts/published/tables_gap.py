@@ -342,6 +342,22 @@ def compensation(records: Records) -> str:
     return table(("t2", *heads), rows, 6)
 
 
+@block("compensation-lockstep", "compensation-lockstep")
+def compensation_lockstep(records: Records) -> str:
+    record, rows = records["compensation-lockstep"], []
+    for late in ("11ms", "396ms"):
+        run = record.runs[f"{DEFAULT}-{late}"]
+        gap = record.gaps.get(f"{DEFAULT}-{late} against {DEFAULT}-11ms")
+        flown = f"{number(run.flight_time_s, 2)} s", f"{number(run.distance_m, 1)} m"
+        changes = (NONE, NONE, NONE)
+        if gap is not None:
+            points = both(gap.success_rate, 1, "+")
+            changes = points, percent(gap.flight_time_s), percent(gap.distance_m)
+        rows.append((late.replace("ms", " ms"), f"{rate(run)} %", *flown, *changes))
+    heads = ("success", "flight time", "distance", "points", "time", "distance against 11 ms")
+    return table(("t2", *heads), rows, 6)
+
+
 @block("any-latency", "any-latency")
 def any_latency(records: Records) -> str:
     record, name = records["any-latency"], "static-obstacles-any-latency"
