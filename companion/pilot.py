@@ -85,10 +85,10 @@ class Pilot:
     """Told every decision when it is sent; it must return at once."""
     memory: DecisionMemory = field(init=False)
     """The setpoints and latencies so far."""
-    earlier: deque[NDArray[Any]] = field(
+    earlier: deque[tuple[NDArray[Any], Kinematics]] = field(
         default_factory=lambda: deque(maxlen=MOST_FRAMES - 1), init=False
     )
-    """What the decisions before saw, the newest first."""
+    """What the decisions before saw, and in what states, the newest first."""
     log: DecisionLog = field(default_factory=DecisionLog, init=False)
     held_us: int = field(default=NO_STAMP, init=False)
     """When the last hold ended."""
@@ -222,7 +222,7 @@ class Pilot:
             state = Kinematics(states.position[0], states.velocity[0], states.quaternion[0])
         told = self.memory.in_flight(age_us)
         earlier = tuple(self.earlier)
-        self.earlier.appendleft(image)
+        self.earlier.appendleft((image, state))
         return observe(
             *(image, frame.intrinsics, state, np.asarray(goal, np.float64)),
             InFlight(told.command[0], told.latency_s[0], told.age_s[0]),

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.policy.observation import InFlight, Kinematics, Rows
+from airl_mav.policy.observation import Earlier, InFlight, Kinematics, Rows
 from airl_mav.prediction.compensator import Compensator
 from airl_mav.prediction.memory import DecisionMemory
 
@@ -53,6 +53,8 @@ class Companions:
             self._memory = DecisionMemory(n)
         self._earlier = np.zeros((earlier, n, *image.shape), image.dtype)
         """What the decisions before saw, the newest first; 0 = no return, black, or none yet."""
+        self._states = Kinematics(*(np.zeros((earlier, n, size)) for size in (3, 3, 4)))
+        """In what states."""
         self._age_us = np.zeros(n, np.int64)
         """Of the frames, when their decisions begin."""
 
@@ -65,11 +67,16 @@ class Companions:
         self._age_us[i] = 0
         self._earlier[:, i] = 0
 
-    def deciding(self, image: NDArray[Any]) -> None:
-        """Keep what all decide on, of the newest images (n, ...), as far as it is seen again."""
-        if len(self._earlier):
-            self._earlier[1:] = self._earlier[:-1]
-            self._earlier[0] = image if self._compensator is None else self._image
+    def deciding(self, image: NDArray[Any], state: Kinematics) -> None:
+        """Keep what all decide on, where it is seen again: newest images (n, ...), telemetry."""
+        if not len(self._earlier):
+            return
+        if self._compensator is not None:
+            image, state = self._image, self._state
+        states = zip(vars(self._states).values(), vars(state).values(), strict=True)
+        for kept, new in ((self._earlier, image), *states):
+            kept[1:] = kept[:-1]
+            kept[0] = new
 
     def aged(self, age_us: Times) -> None:
         """Take how old the frames (n,) are of which the next decisions are made."""
@@ -129,15 +136,18 @@ class Companions:
         """Return what policies may be told of the decisions; None: nobody keeps account."""
         return None if self._memory is None else self._memory.in_flight(self._age_us).rows(rows)
 
-    def earlier(self, rows: Rows) -> tuple[NDArray[Any], ...]:
-        """Return the images (k, ...) of the decisions before, the newest first."""
-        return tuple(image[rows] for image in self._earlier)
+    def earlier(self, rows: Rows) -> Earlier:
+        """Return what the decisions before saw, and in what states, the newest first."""
+        kept = (self._earlier, *vars(self._states).values())
+        return [
+            (each[0][rows], Kinematics(*each[1:]).rows(rows)) for each in zip(*kept, strict=True)
+        ]
 
     def held(self) -> Mapping[str, Any]:
         """Return by name all arrays that change, for checkpoints."""
         held: dict[str, Any] = {}
         if len(self._earlier):
-            held["earlier"] = {"depth_mm": self._earlier}
+            held["earlier"] = {"depth_mm": self._earlier, **vars(self._states)}
         if self._compensator is not None:
             foreseen = {"depth_mm": self._image, **vars(self._state)}
             held["compensator"] = {**self._compensator.held(), "foreseen": foreseen}

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.core.kernels import kernel
+from airl_mav.envs.scanning import COMPILED_SCANNING
 from airl_mav.policy.images import Bytes, Shrink
 
 
@@ -28,7 +29,7 @@ def shrink_colour(image: NDArray[np.uint8], rows: int, columns: int) -> NDArray[
     return images
 
 
-COMPILED = Shrink(shrink_depth, shrink_colour)
+COMPILED = Shrink(shrink_depth, shrink_colour, COMPILED_SCANNING)
 """As the batch twin does it."""
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.camera.frame import MAX_MM, MM_PER_M
+from airl_mav.policy.scans import NUMPY_SCANNING, Scanning
 
 
 class Bytes(NamedTuple):
@@ -34,6 +35,8 @@ class Shrink(NamedTuple):
     colour: Callable[[NDArray[np.uint8], int, int], NDArray[np.uint8]]
     """From sRGB or grey images (n, h, w, channels), rows and columns to (n, channels, rows,
     columns): means of blocks."""
+    scanning: Scanning
+    """From depth images to level scans."""
 
 
 def shrink_depth(
@@ -60,7 +63,7 @@ def shrink_colour(image: NDArray[np.uint8], rows: int, columns: int) -> NDArray[
     return mean
 
 
-NUMPY = Shrink(shrink_depth, shrink_colour)
+NUMPY = Shrink(shrink_depth, shrink_colour, NUMPY_SCANNING)
 """As the companion does it, which has no numba."""
 
 

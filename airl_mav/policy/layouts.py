@@ -2,9 +2,10 @@
 
 `body` is the default: the camera's image, and goal and velocity in the heading frame. `paper` is
 Air Learning's own input as its code has it: a 154 x 256 image whose top rows draw the bearing of
-the goal, and vectors in the world frame. Both are Dicts of the image, `velocity` and `goal`; the
-image's key is what the camera gives: `depth`, `rgb` or `grey`. Any other is the user's own: a
-class, made without arguments, whose objects are a `Layout`.
+the goal, and vectors in the world frame. `scan` is `body` with a level scan, as a planar lidar's,
+in place of the depth image; earlier frames are carried to where the vehicle is now. All are Dicts
+of the image, `velocity` and `goal`; the image's key is what the camera gives: `depth`, `rgb` or
+`grey`. Any other is the user's own: a class, made without arguments, whose objects are a `Layout`.
 
 The function that trains is the function that flies: `encode_layout` takes n vehicles at a time,
 and the companion is n = 1.
@@ -25,13 +26,14 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core import plugins
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import ProfileModel, quantity
-from airl_mav.core.frames import heading_to_ned
+from airl_mav.core.frames import heading_to_ned, ned_to_heading, quats_to_euler
 from airl_mav.policy.images import NUMPY, Shrink, body_bytes, paper_bytes
 from airl_mav.policy.observation import InFlight, Observation
+from airl_mav.policy.scans import Moved, goes_round, rays_of, scan_bytes, tilt_of
 from airl_mav.profiles.camera_kind import CHANNELS, KINDS, CameraKind
 from airl_mav.profiles.projection import CYLINDER_MOST_DEG, Projection, check_fov
 
-SHIPPED = ("body", "paper")
+SHIPPED = ("body", "paper", "scan")
 LayoutName = Annotated[str, plugins.part_name(plugins.LAYOUTS, SHIPPED)]
 Encoded = dict[str, NDArray[Any]]
 
@@ -60,6 +62,10 @@ DISTANCE_SCALE_M = 20.0
 
 STRIP_ROWS = 10
 """`paper`: rows on top of the image that draw the bearing of the goal, the last one black."""
+
+SEAM_SHARE = 8
+"""`scan`: so many-th of the bearings of a camera that sees all round are repeated at either end, so
+that a convolution sees what is behind the vehicle in one piece."""
 
 STRIP_HALF_WIDTH = 1
 """`paper`: the bar that draws the bearing is three columns wide."""
@@ -121,8 +127,8 @@ class ObservationSpec(ProfileModel):
             )
         if self.frames > 1 and self.layout == "paper":
             raise ValueError(f"frames = {self.frames}: accepted: 1 with layout 'paper'")
-        if self.kind != "depth" and self.layout == "paper":
-            raise ValueError(f"kind = {self.kind!r}: accepted: 'depth' with layout 'paper'")
+        if self.kind != "depth" and self.layout in ("paper", "scan"):
+            raise ValueError(f"kind = {self.kind!r}: accepted: 'depth' with layout {self.layout!r}")
         check_fov("horizontal_fov_deg", self.projection, self.horizontal_fov_deg)
         return self
 
@@ -132,9 +138,22 @@ class ObservationSpec(ProfileModel):
         return self.height_px - (STRIP_ROWS if self.layout == "paper" else 0)
 
     @property
+    def image_shape(self) -> tuple[int, int]:
+        """Rows and columns of the image as it goes into the network."""
+        if self.layout != "scan":
+            return self.height_px, self.width_px
+        return self.frames, self.width_px + 2 * self.seam
+
+    @property
+    def seam(self) -> int:
+        """Bearings of a scan that are repeated at either end."""
+        whole = self.layout == "scan" and goes_round(math.radians(self.horizontal_fov_deg))
+        return self.width_px // SEAM_SHARE if whole else 0
+
+    @property
     def channels(self) -> int:
         """Channels of the image that the network sees: those of a frame, for each frame."""
-        return CHANNELS[self.kind] * self.frames
+        return 1 if self.layout == "scan" else CHANNELS[self.kind] * self.frames
 
 
 class Box(NamedTuple):
@@ -167,7 +186,7 @@ def boxes(spec: ObservationSpec) -> dict[str, Box]:
     if spec.layout not in SHIPPED:
         return _own_boxes(spec)
     found = {
-        spec.kind: Box((spec.channels, spec.height_px, spec.width_px), np.uint8, 0, 255),
+        spec.kind: Box((spec.channels, *spec.image_shape), np.uint8, 0, 255),
         VELOCITY: Box((3,), np.float32, -math.inf, math.inf),
         GOAL: Box((3,), np.float32, -math.inf, math.inf),
     }
@@ -218,6 +237,10 @@ def encode_layout(spec: ObservationSpec, seen: Observation, shrink: Shrink = NUM
         The image uint8, the newest frame first: `depth` (n, frames, height, width), "no return"
         where there was none yet; `rgb` (n, 3 frames, height, width) and `grey` (n, frames, height,
         width), black where there was none yet. `velocity` (n, 3) and `goal` (n, 3) float32.
+        `scan`: `depth` (n, 1, frames, bearings) of `policy.scans.scan_bytes`, a row for each frame,
+        with as many bearings as the image is wide, and those at either end once more for a camera
+        that sees all round; earlier frames carried to the present place and heading. Else as
+        `body`.
         `body`: velocity forward, right, down / 5 m/s; goal as cosine and sine of its bearing and
         its distance / 20 m. `paper`: velocity NED [m/s]; goal as north, east [m] and distance [m].
         Where the network is told more, `in_flight` (n, k) float32: forward, right / 5 m/s and yaw
@@ -230,8 +253,8 @@ def encode_layout(spec: ObservationSpec, seen: Observation, shrink: Shrink = NUM
     if spec.layout not in SHIPPED:
         return _own_arrays(spec, seen)
     distance = np.hypot(seen.goal[:, 0], seen.goal[:, 1])
-    image = _images(spec, seen, shrink)
-    if spec.layout == "body":
+    image = _scans(spec, seen, shrink) if spec.layout == "scan" else _images(spec, seen, shrink)
+    if spec.layout != "paper":
         safe = np.maximum(distance, 1e-6)
         goal = np.stack(
             [seen.goal[:, 0] / safe, seen.goal[:, 1] / safe, distance / DISTANCE_SCALE_M], axis=1
@@ -274,6 +297,23 @@ def _images(spec: ObservationSpec, seen: Observation, shrink: Shrink) -> NDArray
     for k, image in enumerate((seen.image, *seen.earlier[: spec.frames - 1])):
         stack[:, k * channels : (k + 1) * channels] = newest if k == 0 else network(image)
     return stack
+
+
+def _scans(spec: ObservationSpec, seen: Observation, shrink: Shrink) -> NDArray[np.uint8]:
+    """Return the network's scans (n, 1, frames, bearings with the seam), the newest first."""
+    make, rays, now = shrink.scanning, rays_of(seen.intrinsics), seen.states[0]
+    images = (seen.depth_mm, *seen.earlier_mm[: spec.frames - 1])
+    scans = np.full((len(seen.goal), spec.frames, spec.width_px), np.inf)
+    for k, (image, state) in enumerate(zip(images, seen.states, strict=False)):
+        roll, pitch, yaw = quats_to_euler(state.quaternion)
+        scan = make.level(image, rays, tilt_of(roll, pitch), spec.width_px)
+        if k > 0:
+            moved = ned_to_heading(state.position - now.position, seen.yaw)
+            by = Moved(moved[:, 0], moved[:, 1], seen.yaw - yaw)
+            scan = make.carried(scan, by, rays.fov_rad)
+        scans[:, k] = scan
+    columns = np.arange(-spec.seam, spec.width_px + spec.seam) % spec.width_px
+    return scan_bytes(scans, spec.range_m)[:, None, :, columns]
 
 
 def _told(names: tuple[Told, ...], known: InFlight | None) -> NDArray[np.float32]:
@@ -345,9 +385,12 @@ def newest_frame(spec: ObservationSpec, seen: Mapping[str, NDArray[Any]]) -> NDA
         seen: Its arrays, without a leading axis.
 
     Returns:
-        (h, w); of rgb (h, w, 3).
+        (h, w); of rgb (h, w, 3). A scan is as high as the camera's image would be.
     """
     channels = seen[spec.kind][: CHANNELS[spec.kind]]
+    if spec.layout == "scan":
+        scan = channels[:, :1, spec.seam : spec.seam + spec.width_px]
+        channels = np.repeat(scan, spec.height_px, axis=1)
     picture: NDArray[np.uint8] = np.ascontiguousarray(np.moveaxis(channels, 0, -1))
     return picture.copy() if spec.kind == "rgb" else picture[..., 0].copy()
 

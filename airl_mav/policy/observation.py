@@ -80,6 +80,8 @@ class Observation:
     """None: nobody keeps account of the decisions."""
     earlier: tuple[NDArray[Any], ...] = ()
     """The images of the decisions before, as far as they are kept, the newest first."""
+    states: tuple[Kinematics, ...] = ()
+    """Own states: the present one, and behind it those of `earlier`."""
 
     def rows(self, index: Rows) -> Observation:
         """Return what vehicle `index` of n sees, or several of them."""
@@ -88,6 +90,7 @@ class Observation:
         if (told := self.in_flight) is not None:
             found["in_flight"] = told.rows(index)
         found["earlier"] = tuple(image[index] for image in self.earlier)
+        found["states"] = tuple(state.rows(index) for state in self.states)
         return replace(self, **found)
 
     @property
@@ -119,6 +122,10 @@ class Observation:
         return math.atan2(self.goal[1], self.goal[0])
 
 
+Earlier = Sequence[tuple[NDArray[Any], Kinematics]]
+"""Images and states of the decisions before, the newest first."""
+
+
 def encode(frame: Frame, state: Kinematics, goal: tuple[float, float]) -> Observation:
     """Return the observation of a frame, telemetry and a goal (north, east [m])."""
     return observe(frame.image, frame.intrinsics, state, np.asarray(goal, np.float64))
@@ -130,7 +137,7 @@ def observe(
     state: Kinematics,
     goal: Vector,
     in_flight: InFlight | None = None,
-    earlier: tuple[NDArray[Any], ...] = (),
+    earlier: Earlier = (),
 ) -> Observation:
     """Return the observation of one vehicle, or of n.
 
@@ -140,7 +147,7 @@ def observe(
         state: Telemetry.
         goal: (..., 2) north, east [m].
         in_flight: What is known of the decisions; None: nothing is.
-        earlier: Images of the decisions before, the newest first.
+        earlier: What the decisions before saw, and the states they saw it in, the newest first.
     """
     roll, pitch, yaw = quats_to_euler(state.quaternion)
     to_goal = np.zeros_like(state.position)
@@ -154,5 +161,6 @@ def observe(
         pitch=pitch,
         yaw=yaw,
         in_flight=in_flight,
-        earlier=earlier,
+        earlier=tuple(image for image, _ in earlier),
+        states=(state, *(then for _, then in earlier)),
     )

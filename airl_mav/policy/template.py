@@ -7,6 +7,8 @@ inference takes depends on the layers' sizes, not on what was learned.
 
 from __future__ import annotations
 
+import math
+
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -72,7 +74,7 @@ def write_template(
         UsageError: The network is too large for one .onnx file.
     """
     spec, outputs = facts.observation, outputs_of(facts.actions)
-    size = template_size(layers, filters, spec.height_px, spec.width_px, outputs, spec.channels)
+    size = template_size(layers, filters, *spec.image_shape, outputs, spec.channels)
     if 4 * size.parameters > GREATEST_BYTES:
         raise UsageError(
             f"--network {layers}x{filters}: {size.parameters:,} parameters; accepted: at most "
@@ -140,7 +142,7 @@ def build_template(
         channels = filters
     flat = node("Flatten", [x], "flat", axis=1)
     x = node("Concat", [flat, VELOCITY, GOAL], "joined", axis=1)
-    inputs = filters * spec.height_px * spec.width_px + VECTOR_INPUTS
+    inputs = filters * math.prod(spec.image_shape) + VECTOR_INPUTS
     for k in range(layers):
         dense = [x, random(f"dense{k}.weight", (filters, inputs)), zeros(f"dense{k}.bias", filters)]
         x = node("Relu", [node("Gemm", dense, f"dense{k}", transB=1)], f"dense{k}.relu")
@@ -148,7 +150,7 @@ def build_template(
     outputs = outputs_of(actions)
     last = [x, random("score.weight", (outputs, inputs)), zeros("score.bias", outputs)]
     node("Gemm", last, ACTION, transB=1)
-    image = ["n", spec.channels, spec.height_px, spec.width_px]
+    image = ["n", spec.channels, *spec.image_shape]
     graph = helper.make_graph(
         nodes,
         "template",

@@ -27,7 +27,7 @@ from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.policy.action_sets import commands, discrete_actions
 from airl_mav.policy.layouts import MOST_FRAMES, encode_layout
 from airl_mav.policy.learned import LearnedPolicy, load_learned
-from airl_mav.policy.observation import InFlight, Kinematics, Observation, observe
+from airl_mav.policy.observation import Earlier, InFlight, Kinematics, Observation, observe
 from airl_mav.policy.registry import find_policy
 from airl_mav.prediction.compensator import Compensator
 from airl_mav.prediction.memory import DecisionMemory
@@ -169,7 +169,7 @@ class _Companion:
         else:
             self._memory = DecisionMemory(1)
             self._memory.begin(0)
-        self._earlier: tuple[NDArray[Any], ...] = ()
+        self._earlier: Earlier = ()
 
     def observe(
         self,
@@ -188,7 +188,7 @@ class _Companion:
             image, state = images[0], states.rows(0)
         told = self._memory.in_flight(age).rows(0)
         earlier = self._earlier
-        self._earlier = (image, *earlier)[: MOST_FRAMES - 1]
+        self._earlier = ((image, state), *earlier)[: MOST_FRAMES - 1]
         where = np.asarray(goal, np.float64)
         in_flight = InFlight(told.command, told.latency_s, told.age_s)
         return observe(image, self._intrinsics, state, where, in_flight, earlier)

@@ -12,6 +12,7 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import Mount
 from airl_mav.envs.arenas import batch_of
 from airl_mav.envs.cameras import lens_of, render_images
+from airl_mav.envs.encoding import COMPILED
 from airl_mav.envs.evaluation import SinglePilots, fly_seeds
 from airl_mav.envs.fleet import Verdict, new_fleet
 from airl_mav.envs.navigation import Navigation
@@ -19,6 +20,8 @@ from airl_mav.envs.spec import spec_of
 from airl_mav.lockstep.flight import fly
 from airl_mav.policy.actions import Action
 from airl_mav.policy.greedy import GreedyPolicy
+from airl_mav.policy.images import NUMPY
+from airl_mav.policy.layouts import MOST_FRAMES, ObservationSpec, encode_layout
 from airl_mav.policy.observation import Observation
 from firmware_sim.plant.camera_server import SimulatedCamera
 from tests.support.lockstep_kit import demo_scenario
@@ -75,6 +78,28 @@ def test_the_companion_gets_the_images_that_the_twin_renders(
     assert len(np.unique(twin)) > 500
     assert np.all((twin[0, :, :] > 0).any(axis=0))
     assert len({each.depth_mm.tobytes() for each in seen}) == len(seen)
+    _check_scans(seen)
+
+
+def _check_scans(seen: list[Observation]) -> None:
+    """Whoever scans what was seen in a flight knows where it saw what, and as the twin does."""
+    camera = seen[0].intrinsics
+    spec = ObservationSpec(
+        layout="scan",
+        height_px=20,
+        width_px=64,
+        projection="cylindrical",
+        horizontal_fov_deg=math.degrees(camera.horizontal_fov_rad),
+        range_m=20.0,
+        frames=3,
+    )
+    for k, each in enumerate(seen):
+        assert len(each.states) == 1 + len(each.earlier) == 1 + min(k, MOST_FRAMES - 1)
+        for before, state in enumerate(each.states):
+            assert state.position.tobytes() == seen[k - before].states[0].position.tobytes()
+        ours, theirs = (encode_layout(spec, each.rows(None), made) for made in (NUMPY, COMPILED))
+        assert ours["depth"].tobytes() == theirs["depth"].tobytes()
+        assert (ours["depth"][:, :, : len(each.states)] < 255).any()
 
 
 @pytest.mark.parametrize("compensate", [False, True])

@@ -555,3 +555,24 @@ def test_zones_and_seeds_are_checked() -> None:
         navigation.begin([0], [1], 3)
     with pytest.raises(UsageError, match="seed = -1"):
         navigation.begin([0], [-1])
+
+
+def test_states_of_the_decisions_before_are_kept_with_their_images() -> None:
+    """Of each vehicle, since its episode began; with the estimator's error, as it was told them."""
+    knobs = {"arena": "static-obstacles", "frames": 3, "layout": "scan"}
+    navigation = Navigation(spec_of(None, {**knobs, "randomisation": {"estimation": True}}), 2)
+    navigation.begin([0, 1], [3, 4])
+    told = []
+    for _ in range(4):
+        seen = navigation.see()
+        told.insert(0, (seen.image.copy(), seen.states[0]))
+        for k, (image, state) in enumerate(told[1:3]):
+            np.testing.assert_array_equal(seen.earlier[k], image)
+            np.testing.assert_array_equal(seen.states[k + 1].position, state.position)
+            np.testing.assert_array_equal(seen.states[k + 1].quaternion, state.quaternion)
+        assert len(seen.states) == 3
+        navigation.fly(np.tile([2.0, 0.0, 0.3], (2, 1)))
+    navigation.begin([1], [9])
+    seen = navigation.see()
+    assert not seen.earlier[0][1].any()
+    assert seen.earlier[0][0].any()

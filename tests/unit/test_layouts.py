@@ -306,7 +306,9 @@ def test_images_of_the_decisions_before_are_stacked_the_newest_first() -> None:
     depth, state, goal = random_state(4)
     before = tuple(np.roll(depth, k, axis=0) for k in (1, 2))
     for kept in range(3):
-        looked = observe(depth, lens(64, 48), state, goal, earlier=before[:kept])
+        looked = observe(
+            depth, lens(64, 48), state, goal, earlier=[(image, state) for image in before[:kept]]
+        )
         # Of one vehicle, as the companion has it.
         alone = looked.rows(2).rows(None)
         for seen_, rows in ((looked, slice(None)), (alone, [2])):
