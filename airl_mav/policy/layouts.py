@@ -26,10 +26,10 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core import plugins
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import ProfileModel, quantity
-from airl_mav.core.frames import heading_to_ned, ned_to_heading, quats_to_euler
+from airl_mav.core.frames import heading_to_ned
 from airl_mav.policy.images import NUMPY, Shrink, body_bytes, paper_bytes
 from airl_mav.policy.observation import InFlight, Observation
-from airl_mav.policy.scans import Moved, goes_round, rays_of, scan_bytes, tilt_of
+from airl_mav.policy.scans import goes_round, scan_bytes, scans_of
 from airl_mav.profiles.camera_kind import CHANNELS, KINDS, CameraKind
 from airl_mav.profiles.projection import CYLINDER_MOST_DEG, Projection, check_fov
 
@@ -301,17 +301,7 @@ def _images(spec: ObservationSpec, seen: Observation, shrink: Shrink) -> NDArray
 
 def _scans(spec: ObservationSpec, seen: Observation, shrink: Shrink) -> NDArray[np.uint8]:
     """Return the network's scans (n, 1, frames, bearings with the seam), the newest first."""
-    make, rays, now = shrink.scanning, rays_of(seen.intrinsics), seen.states[0]
-    images = (seen.depth_mm, *seen.earlier_mm[: spec.frames - 1])
-    scans = np.full((len(seen.goal), spec.frames, spec.width_px), np.inf)
-    for k, (image, state) in enumerate(zip(images, seen.states, strict=False)):
-        roll, pitch, yaw = quats_to_euler(state.quaternion)
-        scan = make.level(image, rays, tilt_of(roll, pitch), spec.width_px)
-        if k > 0:
-            moved = ned_to_heading(state.position - now.position, seen.yaw)
-            by = Moved(moved[:, 0], moved[:, 1], seen.yaw - yaw)
-            scan = make.carried(scan, by, rays.fov_rad)
-        scans[:, k] = scan
+    scans = scans_of(seen, spec.frames, spec.width_px, shrink.scanning)
     columns = np.arange(-spec.seam, spec.width_px + spec.seam) % spec.width_px
     return scan_bytes(scans, spec.range_m)[:, None, :, columns]
 

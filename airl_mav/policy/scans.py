@@ -20,6 +20,8 @@ from numpy.typing import NDArray
 
 from airl_mav.camera.frame import MM_PER_M
 from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.core.frames import ned_to_heading, quats_to_euler
+from airl_mav.policy.observation import Observation
 
 Floats = NDArray[np.float64]
 
@@ -162,6 +164,34 @@ def carried(scans: Floats, moved: Moved, fov_rad: float) -> Floats:
 
 NUMPY_SCANNING = Scanning(level_scan, carried)
 """As the companion does it, which has no numba."""
+
+
+def scans_of(
+    seen: Observation, frames: int, bearings: int, make: Scanning = NUMPY_SCANNING
+) -> Floats:
+    """Return the scans of n vehicles, all as from where they are now.
+
+    Args:
+        seen: Depth images of n vehicles, and in what states they were seen.
+        frames: How many scans each: of this decision, and of those before.
+        bearings: How many each has.
+        make: What makes them.
+
+    Returns:
+        (n, frames, bearings) ranges [m], the newest first; infinite: nothing, or no frame yet.
+    """
+    rays, now = rays_of(seen.intrinsics), seen.states[0]
+    scans = np.full((len(seen.goal), frames, bearings), np.inf)
+    images = (seen.depth_mm, *seen.earlier_mm)[:frames]
+    for k, (image, state) in enumerate(zip(images, seen.states, strict=False)):
+        roll, pitch, yaw = quats_to_euler(state.quaternion)
+        scan = make.level(image, rays, tilt_of(roll, pitch), bearings)
+        if k > 0:
+            ahead = ned_to_heading(state.position - now.position, seen.yaw)
+            moved = Moved(ahead[:, 0], ahead[:, 1], seen.yaw - yaw)
+            scan = make.carried(scan, moved, rays.fov_rad)
+        scans[:, k] = scan
+    return scans
 
 
 def goes_round(fov_rad: float) -> bool:

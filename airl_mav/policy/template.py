@@ -8,7 +8,6 @@ inference takes depends on the layers' sizes, not on what was learned.
 from __future__ import annotations
 
 import math
-
 from pathlib import Path
 from typing import Any, NamedTuple
 
