@@ -26,7 +26,7 @@ SHIPPED: dict[str, tuple[str, str]] = {
     "crowded": ("generalisation", "crowded-crowded"),
     "crowded-pipelined": ("crowded-pipelined", "run"),
     "crowded-fast": ("crowded-fast", "run"),
-    "crowded-panorama-fast": ("crowded-panorama-fast", "run"),
+    "crowded-panorama": ("crowded-panorama", "run"),
 }
 """Where the flights of each policy stand: in its own arena, as late as in its training."""
 
