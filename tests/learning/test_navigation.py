@@ -562,7 +562,7 @@ def test_states_of_the_decisions_before_are_kept_with_their_images() -> None:
     knobs = {"arena": "static-obstacles", "frames": 3, "layout": "scan"}
     navigation = Navigation(spec_of(None, {**knobs, "randomisation": {"estimation": True}}), 2)
     navigation.begin([0, 1], [3, 4])
-    told = []
+    told: list[tuple[np.ndarray, Kinematics]] = []
     for _ in range(4):
         seen = navigation.see()
         told.insert(0, (seen.image.copy(), seen.states[0]))

@@ -163,7 +163,8 @@ def test_the_compiled_scans_are_those_of_numpy(camera: Intrinsics) -> None:
     np.testing.assert_allclose(scans[0], scans[1], rtol=1e-14)
     scans[0][rng.random(scans[0].shape) < 0.5] = np.inf
     for far_m in (0.0, 0.3, 3.0):
-        by = Moved(*(far_m * rng.normal(size=(2, 6))), rng.uniform(-4.0, 4.0, 6))
+        ahead, right = far_m * rng.normal(size=(2, 6))
+        by = Moved(ahead, right, rng.uniform(-4.0, 4.0, 6))
         ours, theirs = (
             make.carried(scans[0], by, rays.fov_rad) for make in (NUMPY.scanning, COMPILED.scanning)
         )
