@@ -222,7 +222,8 @@ class EnvironmentSpec(ProfileModel):
     arena: str = Field(default="static-obstacles", description="arena profile")
     layout: LayoutName = Field(
         default="body",
-        description="observation layout: body, paper, or your own as MODULE:NAME or FILE.py:NAME",
+        description="observation layout: body, paper, scan, or your own as MODULE:NAME or"
+        " FILE.py:NAME",
     )
     image_width_px: int = quantity("image that the network sees", "px", ge=4, le=640, default=32)
     image_height_px: int = quantity("image that the network sees", "px", ge=4, le=480, default=24)
