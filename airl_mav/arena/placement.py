@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import cast
+from typing import Any
 
 import numpy as np
 
@@ -173,7 +173,7 @@ def _place_all(
 
 def _give_back(rng: np.random.Generator, count: int) -> None:
     """Let a generator draw its last `count` uniform numbers once more."""
-    bits = cast(np.random.PCG64, rng.bit_generator)
+    bits: Any = rng.bit_generator  # One that can go back: that of `default_rng`.
     # Half of a number may wait to be drawn as a whole number; `advance` forgets it.
     waiting = bits.state
     bits.advance(-count)
