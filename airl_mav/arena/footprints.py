@@ -123,11 +123,11 @@ def segment_clear(start: Floats, end: Floats, center: Floats, half: Floats) -> b
 
 
 @kernel
-def draw_points(rng: np.random.Generator, low: Floats, span: Floats, points: Floats) -> None:
-    """Draw points (n, 2) of a rectangle: the numbers of `rng.uniform(low, low + span, (n, 2))`."""
-    for i in range(len(points)):
+def draw_numbers(rng: np.random.Generator, numbers: Floats) -> None:
+    """Draw numbers (n, 2), uniform in [0, 1): those of `rng.random((n, 2))`."""
+    for i in range(len(numbers)):
         for axis in range(2):
-            points[i, axis] = low[axis] + span[axis] * rng.random()
+            numbers[i, axis] = rng.random()
 
 
 def inner(bounds: Bounds, margin: float | Floats) -> tuple[Floats, Floats]:

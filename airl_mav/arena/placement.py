@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from airl_mav.arena.footprints import Boxes, Floats, draw_points, inner, outside, with_room
+from airl_mav.arena.footprints import Boxes, Floats, draw_numbers, inner, outside, with_room
 from airl_mav.arena.geometry import Bounds
 from airl_mav.core.kernels import kernel
 
@@ -51,43 +51,32 @@ def draw_place(
     Returns:
         Whether there was one within TRIES tries.
     """
-    if not _fits(half, low, high, gap_m):
+    lowest = low + (half + gap_m)
+    span, grown = high - (half + gap_m) - lowest, taken + half
+    if span.min() < 0.0:
         return False
-    numbers, origin, square = np.empty((BATCH, 2)), np.zeros(2), np.ones(2)
+    numbers = np.empty((BATCH, 2))
     for _ in range(BATCHES):
-        draw_points(rng, origin, square, numbers)
-        if _first_free(numbers, half, center, taken, low, high, gap_m, place):
+        draw_numbers(rng, numbers)
+        if _first_free(numbers, lowest, span, center, grown, place):
             return True
     return False
 
 
 @kernel
-def _fits(half: Floats, low: Floats, high: Floats, gap_m: float) -> bool:
-    """Return whether a box, `gap_m` away from the walls, is no larger than the floor."""
-    for axis in range(2):
-        margin = half[axis] + gap_m
-        if low[axis] + margin > high[axis] - margin:
-            return False
-    return True
-
-
-@kernel
 def _first_free(
-    numbers: Floats,
-    half: Floats,
-    center: Floats,
-    taken: Floats,
-    low: Floats,
-    high: Floats,
-    gap_m: float,
-    place: Floats,
+    numbers: Floats, lowest: Floats, span: Floats, center: Floats, grown: Floats, place: Floats
 ) -> bool:
-    """Write the first free one of the places that `numbers` (k, 2), uniform in [0, 1), stand for.
+    """Write the first point of a rectangle that is in no box; return whether there is one.
 
-    The other arguments are those of `draw_place`, and so is what is returned.
+    Args:
+        numbers: (k, 2) uniform in [0, 1): where in the rectangle the points are.
+        lowest: (2,) its south-west corner [m].
+        span: (2,) its sides [m].
+        center: (m, 2) centres of the boxes [m].
+        grown: (m, 2) their half extents [m].
+        place: (2,) north, east [m]; written.
     """
-    lowest, highest = low + (half + gap_m), high - (half + gap_m)
-    span, grown = highest - lowest, taken + half
     for number in numbers:
         for axis in range(2):
             place[axis] = lowest[axis] + span[axis] * number[axis]
@@ -159,12 +148,12 @@ def _place_all(
     n, used = len(halves), 0
     while placed < n and tried < BATCHES and used < len(batches):
         i, at = placed, len(center) - n + placed
-        if not _fits(halves[i], low, high, gap_m):
+        lowest = low + (halves[i] + gap_m)
+        span, grown = high - (halves[i] + gap_m) - lowest, half[:at] + halves[i]
+        if span.min() < 0.0:
             return placed, BATCHES, used
         used += 1
-        if _first_free(
-            batches[used - 1], halves[i], center[:at], half[:at], low, high, gap_m, center[at]
-        ):
+        if _first_free(batches[used - 1], lowest, span, center[:at], grown, center[at]):
             placed, tried = placed + 1, 0
         else:
             tried += 1

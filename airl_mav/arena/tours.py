@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.footprints import Boxes, Floats, draw_points, inner, segment_clear, with_room
+from airl_mav.arena.footprints import Boxes, Floats, draw_numbers, inner, segment_clear, with_room
 from airl_mav.arena.geometry import Arena, Bounds, Tour
 from airl_mav.arena.placement import draw_place
 from airl_mav.core.kernels import kernel
@@ -218,13 +218,14 @@ def _draw_waypoint(
     there: Floats,
 ) -> bool:
     """Write the first point that is drawn at the end of a free leg."""
-    points = np.empty((BATCH, 2))
+    numbers = np.empty((BATCH, 2))
     for _ in range(BATCHES):
-        draw_points(rng, low, span, points)
-        for point in points:
-            length = math.hypot(point[0] - here[0], point[1] - here[1])
-            if LEG_MIN_M <= length <= leg_max_m and segment_clear(here, point, center, half):
-                there[:] = point
+        draw_numbers(rng, numbers)
+        for number in numbers:
+            for axis in range(2):
+                there[axis] = low[axis] + span[axis] * number[axis]
+            length = math.hypot(there[0] - here[0], there[1] - here[1])
+            if LEG_MIN_M <= length <= leg_max_m and segment_clear(here, there, center, half):
                 return True
     return False
 

@@ -67,10 +67,13 @@ class Companions:
         self._age_us[i] = 0
         self._earlier[:, i] = 0
 
+    @property
+    def remember(self) -> bool:
+        """Whether they keep what they saw: their policies see it again."""
+        return len(self._earlier) > 0
+
     def deciding(self, image: NDArray[Any], state: Kinematics) -> None:
-        """Keep what all decide on, where it is seen again: newest images (n, ...), telemetry."""
-        if not len(self._earlier):
-            return
+        """Keep what all decide on, of those that `remember`: newest images (n, ...), telemetry."""
         if self._compensator is not None:
             image, state = self._image, self._state
         states = zip(vars(self._states).values(), vars(state).values(), strict=True)
@@ -146,7 +149,7 @@ class Companions:
     def held(self) -> Mapping[str, Any]:
         """Return by name all arrays that change, for checkpoints."""
         held: dict[str, Any] = {}
-        if len(self._earlier):
+        if self.remember:
             held["earlier"] = {"depth_mm": self._earlier, **vars(self._states)}
         if self._compensator is not None:
             foreseen = {"depth_mm": self._image, **vars(self._state)}

@@ -334,7 +334,8 @@ class Navigation(Stateful):
             self._trace.deciding(self.fleet)
         began_us = self.fleet.time_us.copy()
         t2_us = self._delays.take(self._decision) + self._extra_us
-        self._companions.deciding(self.cameras.image, self.kinematics())
+        if self._companions.remember:
+            self._companions.deciding(self.cameras.image, self.kinematics())
         self._companions.aged(self._timing.fly(self, setpoints, t2_us))
         self._decision += 1
         self._telemetry.step(self._decision, (self.fleet.time_us - began_us) / US_PER_S)
