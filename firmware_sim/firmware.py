@@ -255,6 +255,7 @@ class Firmware:
                 clock=self.clock,
                 autopilot=autopilot,
                 recording=self._recording,
+                read_by=self._pacing.read_by,
             )
         except BaseException:
             autopilot.close()

@@ -47,6 +47,13 @@ class Pacing(Protocol):
         """
         ...
 
+    def read_by(self, began_us: int) -> int:
+        """Return a time by which what was just read had arrived, reading began at `began_us` [µs].
+
+        Never before `began_us`, nor before a time that was handed out.
+        """
+        ...
+
 
 class WallPacing:
     """Runs every tick at its wall time."""
@@ -104,6 +111,15 @@ class WallPacing:
             now_us = resumed_us
         return self._stamp(now_us)
 
+    def read_by(self, began_us: int) -> int:
+        """Return the time now [µs]; `began_us` where so much passed since that it is given up.
+
+        Between its reading of the clock and of the sockets a process can lose the processor: what
+        arrived meanwhile would bear a time from before it was sent.
+        """
+        now_us = self.clock.time_us()
+        return self._stamp(now_us if now_us - began_us <= MAX_LAG_US else began_us)
+
     def _stamp(self, now_us: int) -> int:
         """Return a time that never goes back."""
         self._stamp_us = max(self._stamp_us, now_us)
@@ -128,3 +144,7 @@ class Unpaced:
         del sockets, readable
         self.clock.sleep_until(tick_us)
         return tick_us
+
+    def read_by(self, began_us: int) -> int:
+        """Return `began_us`: time stands still while sockets are read."""
+        return began_us

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,13 @@ from firmware_sim.plant.plant import Plant
 class SetpointLog:
     """When each offboard setpoint was accepted, and when the motors first reflected it."""
 
-    def __init__(self) -> None:
+    def __init__(self, read_by: Callable[[int], int] | None = None) -> None:
+        """Start empty.
+
+        `read_by` tells of what was read from a time on [µs] by when it had arrived [µs]; None = no
+        time passes while it is read.
+        """
+        self._read_by = read_by
         self._accepted: list[tuple[int, tuple[float, float, float, float]]] = []
         self._motor_us: list[int] = []
         self._under_way: list[list[int]] = []
@@ -37,7 +43,9 @@ class SetpointLog:
         return len(self._accepted) > len(self._motor_us)
 
     def accepted(self, setpoint: Setpoint, time_us: int) -> None:
-        """Note an accepted setpoint and when it was received [µs]."""
+        """Note an accepted setpoint, read from `time_us` on [µs]."""
+        if self._read_by is not None:
+            time_us = self._read_by(time_us)
         self._accepted.append((time_us, setpoint.wire))
 
     def take(self, ticks_to_motors: int) -> None:
@@ -80,9 +88,18 @@ class FlightRecorder:
     It grows by some 100 kB per simulated second, so a flight that nobody reads has none.
     """
 
-    def __init__(self, internals: BuiltinAutopilot | None) -> None:
-        """Start empty; `internals` are those of the flight controller, None = nothing."""
-        self.setpoints = SetpointLog()
+    def __init__(
+        self,
+        internals: BuiltinAutopilot | None,
+        read_by: Callable[[int], int] | None = None,
+    ) -> None:
+        """Start empty.
+
+        Args:
+            internals: Those of the flight controller; None = nothing.
+            read_by: As `SetpointLog` takes it.
+        """
+        self.setpoints = SetpointLog(read_by)
         """Stays empty where nobody can look into the flight controller."""
         self._internals = internals
         if internals is not None:

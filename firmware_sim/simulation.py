@@ -76,6 +76,7 @@ class Simulation:
         clock: Clock,
         autopilot: FlightController | None = None,
         recording: bool = True,
+        read_by: Callable[[int], int] | None = None,
     ) -> None:
         """Put the vehicle at the start.
 
@@ -85,6 +86,8 @@ class Simulation:
             clock: Read for stamps only; time moves by `tick`.
             autopilot: Who flies, just booted; None = the built-in autopilot, booted here.
             recording: Whether the flight is recorded; if not, it may go on for ever.
+            read_by: Tells of what was read from a time on [µs] by when it had arrived [µs], for
+                the record; None = no time passes while it is read.
 
         Raises:
             UsageError: The vehicle's parameter overrides are wrong.
@@ -120,8 +123,10 @@ class Simulation:
             self._camera = camera
             if self.faults is not None:
                 self._camera = FailingCamera(camera, self.faults, setup.seed)
-        self.recorder = FlightRecorder(self.autopilot.internals) if recording else None
+        self.recorder: FlightRecorder | None = None
         """None = nothing is recorded."""
+        if recording:
+            self.recorder = FlightRecorder(self.autopilot.internals, read_by)
         self.start_us = start_us
         self.time_us = start_us
         """Simulated time of the newest sample."""

@@ -130,6 +130,10 @@ class Conductor:
         self.clock.sleep_until(tick_us)
         return tick_us
 
+    def read_by(self, began_us: int) -> int:
+        """Return `began_us`: time stands still while the vehicle reads."""
+        return began_us
+
     # --- one turn
 
     def _give_turn(self, readable: Callable[[int], object]) -> None:

@@ -88,6 +88,27 @@ def test_stamps_never_go_back(talking: list[int]) -> None:
     assert slips >= 2
 
 
+def test_what_is_read_bears_a_time_from_after_its_arrival() -> None:
+    paced = WallPacing(1.0)
+    began_us = paced.wait(paced.clock.time_us() + TICK_US, [], never)
+    time.sleep(0.002)
+    arrived_us = paced.clock.time_us()
+    read_us = paced.read_by(began_us)
+    assert arrived_us <= read_us <= paced.clock.time_us()
+    # Reading again, from an earlier time, does not go back; the next tick's time neither.
+    assert paced.read_by(began_us) >= read_us
+    assert paced.wait(0, [], never) >= read_us
+
+
+def test_what_is_read_bears_no_time_that_is_given_up() -> None:
+    paced = WallPacing(FAST)
+    began_us = paced.wait(paced.clock.time_us() + TICK_US, [], never)
+    time.sleep(0.01)
+    assert paced.read_by(began_us) == began_us
+    assert paced.wait(began_us + TICK_US, [], never) == began_us + TICK_US
+    assert Unpaced().read_by(began_us) == began_us
+
+
 def test_unpaced_time_is_the_tick() -> None:
     free = Unpaced()
     free.restart(8_000)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import gc
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -54,6 +54,38 @@ def fly(flown: Firmware, ticks: int, setpoint: Setpoint | None = None) -> None:
         if setpoint is not None and i % 10 == 0:
             autopilot_of(flown).offer_setpoint(setpoint, flown.clock.time_us())
         flown.step()
+
+
+class Preempted(WallPacing):
+    """The process loses the processor between the clock and the sockets."""
+
+    def wait(self, tick_us: int, sockets: Sequence[int], readable: Callable[[int], object]) -> int:
+        began_us = super().wait(tick_us, sockets, readable)
+        time.sleep(0.003)
+        return began_us
+
+
+def test_a_setpoint_is_not_accepted_before_it_was_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+    flown = firmware(Preempted(1.0), recording=True)
+    flown.load(EpisodeSetup(quad(), None, 1), None, 0)
+    sent_us: list[int] = []
+    setpoint = velocity_setpoint(1.0, 0.0, 0.0, yaw=float("nan"), yaw_rate=0.0)
+    receive = flown.flight_stack.receive
+
+    def arrive_now(now_us: int) -> None:
+        sent_us.append(flown.clock.time_us())
+        autopilot_of(flown).offer_setpoint(setpoint, now_us)
+        receive(now_us)
+
+    monkeypatch.setattr(flown.flight_stack, "receive", arrive_now)
+    fly(flown, 10)
+    log = simulated(flown).arrays()
+    flown.close()
+    accepted_us, motor_us = log["setpoints/accepted_us"], log["setpoints/motor_us"]
+    assert len(accepted_us) >= 5
+    assert np.all(accepted_us >= sent_us[: len(accepted_us)])
+    assert np.all(np.diff(accepted_us) >= 0)
+    assert np.all(motor_us >= accepted_us)
 
 
 def blocks_kept_by_two_minutes(*, recording: bool) -> int:
