@@ -17,6 +17,7 @@ from airl_mav.arena.placement import TRIES, NoRoomError, place_all
 from airl_mav.arena.tours import draw_tours
 from airl_mav.arena.zones import draw_goal, zone_radius_m
 from airl_mav.core.errors import UsageError
+from airl_mav.core.seeding import seeded
 from airl_mav.profiles.arena import OBSTACLES, ArenaSpec
 
 LAYOUTS = 20
@@ -127,7 +128,7 @@ def free_area_fraction(arena: Arena) -> float:
 
 def _rng(seed: int, stream: _Stream) -> np.random.Generator:
     """Return the generator of one stream."""
-    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(stream,)))
+    return seeded(seed, stream)
 
 
 def _draw_counts(spec: ArenaSpec, seed: int) -> tuple[int, int]:

@@ -6,6 +6,8 @@ from enum import IntEnum
 
 import numpy as np
 
+from airl_mav.core.seeding import seeded
+
 
 class Stream(IntEnum):
     """First word of a stream's key.
@@ -27,7 +29,7 @@ class Stream(IntEnum):
 
 def stream(seed: int, name: Stream, *more: int) -> np.random.Generator:
     """Return the generator of one stream of an episode; `more` numbers tell its parts apart."""
-    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(name, *more)))
+    return seeded(seed, name, *more)
 
 
 def sensors_and_gusts(
