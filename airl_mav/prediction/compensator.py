@@ -190,27 +190,27 @@ class Compensator:
 
     def _heading_rate(self, now_us: NDArray[np.int64]) -> Vector:
         """Return the rates (n,) [rad/s] at which the vehicles turn, by their setpoints alone."""
-        turns, begins = self._setpoint[:, ::-1, 3].T, self._answered_us.T[::-1]
+        turns, begins_us = self._setpoint[:, ::-1, 3].T, self._answered_us.T[::-1]
+        ends_us = np.minimum(np.vstack([begins_us[1:], now_us]), now_us)
+        answered_s = np.maximum(ends_us - begins_us, 0) / US_PER_S
+        fading = np.exp(-answered_s / self._response.yaw_rate_time_s)
         rate: Vector = turns[0]
-        for turn, begins_us, ends_us in zip(turns, begins, [*begins[1:], now_us], strict=True):
-            answered_s = np.maximum(np.minimum(ends_us, now_us) - begins_us, 0) / US_PER_S
-            rate = turn + (rate - turn) * np.exp(-answered_s / self._response.yaw_rate_time_s)
+        for turn, kept in zip(turns, fading, strict=True):
+            rate = turn + (rate - turn) * kept
         return rate
 
     def _carried(self, motion: Motion, now_us: NDArray[np.int64]) -> tuple[Motion, Vector]:
         """Return how the vehicles will move, and the setpoints (n, 4) that will be in effect."""
         acts_us = now_us + self.memory.latency.expected_us() + LINK_US
         flown = [*self._setpoint.swapaxes(0, 1)[::-1], np.zeros_like(self._setpoint[:, 0])]
-        ends = [*self._answered_us.T[-2::-1], self._stopped_us, acts_us]
-        command, begins_us = flown[0], now_us
-        for setpoint, end_us in zip(flown, ends, strict=True):
-            ends_us = np.clip(end_us, begins_us, acts_us)
-            lasts = ends_us > begins_us
-            if lasts.any():
-                seconds = (ends_us - begins_us) / US_PER_S
-                motion = flown_on(motion, setpoint, self._response, seconds)
-                command = np.where(lasts[:, None], setpoint, command)
-            begins_us = ends_us
+        # Each lasts until the next is answered, none begins before now or lasts longer than asked.
+        marks_us = np.vstack([now_us, self._answered_us.T[-2::-1], self._stopped_us, acts_us])
+        marks_us = np.minimum(np.maximum.accumulate(marks_us), acts_us)
+        seconds = np.diff(marks_us, axis=0) / US_PER_S
+        command = flown[0]
+        for k in np.flatnonzero(seconds.any(axis=1)).tolist():
+            motion = flown_on(motion, flown[k], self._response, seconds[k])
+            command = np.where(seconds[k, :, None] > 0.0, flown[k], command)
         return motion, command
 
     def _keep(
