@@ -16,6 +16,10 @@ MAX_LAG_US = 200_000
 MAX_WAKES = 16
 """So often in one tick is the wait for it broken by what arrives; more waits for the tick."""
 
+READ_AFTER_S = 300e-6
+"""What arrives so shortly before a tick is read when it has begun, and taken by it all the same:
+what many clients send takes as long to be carried out, and must not make it late [s]."""
+
 PR_SET_TIMERSLACK = 29
 """Option of prctl(2) (linux/prctl.h): how late the kernel may wake the calling thread [ns]."""
 
@@ -94,7 +98,11 @@ class WallPacing:
         while (wait_s := clock.wall_seconds_until(tick_us)) > 0.0:
             # A flood must not keep the processor busy until the tick: what it lacks then is missed
             # by the companion.
-            ready, _, _ = select.select(sockets if woken < MAX_WAKES else (), [], [], wait_s)
+            free_s = wait_s - READ_AFTER_S
+            if free_s > 0.0 and woken < MAX_WAKES:
+                ready, _, _ = select.select(sockets, [], [], free_s)
+            else:
+                ready, _, _ = select.select((), [], [], wait_s)
             woken += 1
             now_us = clock.time_us()
             if now_us - tick_us > MAX_LAG_US:
