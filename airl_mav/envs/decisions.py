@@ -69,7 +69,11 @@ class Decisions:
     def _begin(self, slots: Sequence[int], seeds: Sequence[int]) -> Flights:
         """Begin episodes in the zone asked for, else that of the curriculum, else the whole."""
         self.navigation.begin(slots, seeds, self._present_zone)
-        self._before = self.navigation.flights()
+        before = self._before
+        if before is None:
+            self._before = self.navigation.flights()
+        else:
+            self._before = before.with_rows(slots, self.navigation.flights(slots))
         return self._before
 
     def _decide(self, actions: NDArray[Any]) -> Decided:

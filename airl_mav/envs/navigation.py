@@ -85,6 +85,13 @@ class Flights:
     touched: NDArray[np.int64]
     """Index of the obstacle that is touched, or `contact.FLOOR`, `WALL`, `NOTHING`."""
 
+    def with_rows(self, rows: Rows, others: Flights) -> Flights:
+        """Return these with `others` in their rows."""
+        replaced = {name: array.copy() for name, array in vars(self).items()}
+        for name, array in replaced.items():
+            array[rows] = getattr(others, name)
+        return Flights(**replaced)
+
 
 class WholeTruth(NamedTuple):
     """What no policy is told, for experts that are imitated."""
@@ -293,19 +300,19 @@ class Navigation(Stateful):
         """Return the state of all n as telemetry reports it: with the estimator's error."""
         return self._telemetry.report(self.truth(rows), rows)
 
-    def flights(self) -> Flights:
-        """Return the status of all flights."""
+    def flights(self, rows: Rows = EVERYONE) -> Flights:
+        """Return the status of all flights, or of those in `rows`; copies."""
         fleet = self.fleet
-        to_goal = self._places.batch.goal - fleet.position[:, :2]
+        to_goal = self._places.batch.goal[rows] - fleet.position[rows, :2]
         return Flights(
-            verdict=fleet.verdict.copy(),
-            time_s=fleet.time_us / US_PER_S,
-            distance_m=fleet.distance.copy(),
-            energy_j=fleet.energy.copy(),
+            verdict=np.array(fleet.verdict[rows]),
+            time_s=fleet.time_us[rows] / US_PER_S,
+            distance_m=np.array(fleet.distance[rows]),
+            energy_j=np.array(fleet.energy[rows]),
             goal_distance_m=np.hypot(to_goal[:, 0], to_goal[:, 1]),
-            speed_m_s=np.linalg.norm(fleet.velocity, axis=1),
-            battery=fleet.battery.copy(),
-            touched=fleet.touched.copy(),
+            speed_m_s=np.linalg.norm(fleet.velocity[rows], axis=1),
+            battery=np.array(fleet.battery[rows]),
+            touched=np.array(fleet.touched[rows]),
         )
 
     def truth(self, rows: Rows = EVERYONE) -> Kinematics:
