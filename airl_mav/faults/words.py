@@ -81,7 +81,7 @@ def fault_text(fields: Mapping[str, Any]) -> str:
     words = [part, kind]
     amount = KINDS[part, kind].amount
     if fields["value"] and amount is not None:
-        words.append(_numbers(fields["value"]) + amount.unit)
+        words.append(_amount_text(fields["value"], amount))
     begins = f"{_numbers([fields['at_s']])}s"
     if fields["phase"] is not None:
         words += ["at", fields["phase"] + (f"+{begins}" if fields["at_s"] else "")]
@@ -90,6 +90,15 @@ def fault_text(fields: Mapping[str, Any]) -> str:
     if fields["for_s"] is not None:
         words += ["for", f"{_numbers([fields['for_s']])}s"]
     return " ".join(words)
+
+
+def _amount_text(values: Sequence[float], amount: Amount) -> str:
+    """Return an amount in its own unit, or in the one in which six digits say it exactly."""
+    for unit, factor in [(amount.unit, 1.0), *amount.units.items()]:
+        text = ",".join(f"{v / factor:g}" for v in values) + unit
+        if _amount(text, amount, text) == list(values):
+            return text
+    return _numbers(values) + amount.unit
 
 
 def _numbers(values: Sequence[float]) -> str:

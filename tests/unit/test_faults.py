@@ -66,6 +66,7 @@ def test_words_and_fields_are_the_same_fault(fault: Fault) -> None:
         ("link loss 20% for 1s at 2s", "link loss 0.2 at 2s for 1s"),
         ("gyro noisy 5x", "gyro noise 5"),
         ("wind gust 6,0,0m/s at climb for 3s", "wind gust 6,0,0m/s at climb for 3s"),
+        ("gyro biased 2,-2,0.5deg/s", "gyro bias 2,-2,0.5deg/s"),
         ("battery drop 95% at 3s", "battery drop 0.95 at 3s"),
         ("companion stopped at offboard+1s for 2s", "companion stopped at offboard+1s for 2s"),
         ("firmware killed at hold", "firmware killed at hold"),
