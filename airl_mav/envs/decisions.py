@@ -24,6 +24,9 @@ FIRST_TRAINING_SEED = 1_000_000
 
 LAST_TRAINING_SEED = 2**31
 
+_FREE = Costs()
+"""Nothing is charged."""
+
 UNBOUNDED = 1e6
 """Bound of what a layout leaves unbounded, in its units: Gymnasium's checker warns of infinity."""
 
@@ -82,7 +85,8 @@ class Decisions:
         if before is None:
             raise gym.error.ResetNeeded("step() before reset()")
         chosen = commands(spec.action_spec, actions)
-        last = self.navigation.whole_truth().fleet.setpoint[:, (0, 1, 3)]
+        charged = spec.costs != _FREE
+        last = self.navigation.whole_truth().fleet.setpoint[:, (0, 1, 3)] if charged else chosen
         self.navigation.fly(chosen)
         now = self._before = self.navigation.flights()
         truncated: NDArray[np.bool_] = now.verdict == Verdict.TIMEOUT
@@ -93,7 +97,7 @@ class Decisions:
                 self.curriculum.record(int(self.navigation.zones[i]), success=success)
         step = Step(before, now, chosen, spec.episode.hold_s)
         reward = self._reward(step)
-        if spec.costs != Costs():
+        if charged:
             reward = reward - costs(spec.costs, last, step)
         return Decided(now, reward, terminated, truncated)
 

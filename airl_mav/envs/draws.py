@@ -95,9 +95,9 @@ class DelayDraws(DrawnAhead):
         """Return t2 (n,) [µs] of each slot's `decision`, counted from 0, one after the other."""
         for i in np.flatnonzero(decision % BLOCK == 0):
             self._draw_block(int(i))
-        picked: NDArray[np.int64] = np.take_along_axis(
-            self._block, (decision % BLOCK)[:, None], axis=1
-        )[:, 0]
+        picked: NDArray[np.int64] = self._block.take(
+            np.arange(len(decision)) * BLOCK + decision % BLOCK
+        )
         return picked
 
     def _draw_block(self, i: int) -> None:

@@ -139,8 +139,10 @@ class Telemetry(Stateful):
         for i in np.flatnonzero(decisions % BLOCK == 0):
             rng = self._rngs[i]
             if rng is not None:
-                self._normals[i] = rng.standard_normal((BLOCK, N_ERRORS))
-        normals = self._normals[np.arange(len(decisions)), decisions % BLOCK]
+                rng.standard_normal(out=self._normals[i])
+        # By whole rows: several times faster than by two indices.
+        rows = np.arange(len(decisions)) * BLOCK + decisions % BLOCK
+        normals = self._normals.reshape(-1, N_ERRORS).take(rows, axis=0)
         self._errors = step_errors(self._model, self._errors, normals, flown_s)
 
     def report(self, truth: Kinematics, rows: Rows) -> Kinematics:
