@@ -177,7 +177,9 @@ class Pacing:
     def clock(self) -> WallClock:
         return self._wall.clock
 
-    epoch_ns = None
+    @property
+    def epoch_ns(self) -> int:
+        return self._wall.epoch_ns
 
     def restart(self, tick_us: int) -> None:
         self._wall.restart(tick_us)
