@@ -6,8 +6,6 @@ from enum import IntEnum
 
 import numpy as np
 
-from airl_mav.core.seeding import seeded
-
 
 class Stream(IntEnum):
     """First word of a stream's key.
@@ -29,6 +27,9 @@ class Stream(IntEnum):
 
 def stream(seed: int, name: Stream, *more: int) -> np.random.Generator:
     """Return the generator of one stream of an episode; `more` numbers tell its parts apart."""
+    # Compiled, and imported late: programs that only tell what they can do need no numba.
+    from airl_mav.core.seeding import seeded
+
     return seeded(seed, name, *more)
 
 
