@@ -165,6 +165,7 @@ def nothing_half_written(run: Path) -> None:
 # --- a process dies
 
 
+@pytest.mark.nightly  # As a rehearsal: test_process_faults.py.
 def test_killed_companion_lets_the_failsafe_land(tmp_path: Path, ground: Ground) -> None:
     ports = choose_ports(ground.port)
     with firmware(tmp_path, ports) as vehicle:

@@ -203,6 +203,7 @@ def test_the_same_flight_gives_the_same_refit(refitted: Refitted) -> None:
 # --- rehearsed on what was fitted
 
 
+@pytest.mark.nightly  # What is fitted, and how it is flown again, have tests of their own.
 @pytest.mark.slow
 def test_rehearsed_on_what_was_fitted_it_is_the_flight(refitted: Refitted, tmp_path: Path) -> None:
     """Once each: with all of the refit, with its parts, and with nothing of it."""

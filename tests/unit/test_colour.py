@@ -293,17 +293,18 @@ def test_every_floor_point_is_dark_where_a_way_to_the_sun_is_blocked(
         for position, attitude in poses(seed, 2):
             seen = see(scene, position, attitude, k)
             floor = seen.seen == primitives.FLOOR
-            p = (np.array(position) + seen.depth_m[..., None] * rays_of(k, attitude))[floor]
+            # Every fifth: all of them take half a minute.
+            p = (np.array(position) + seen.depth_m[..., None] * rays_of(k, attitude))[floor][::5]
             # Where the way leaves the walls, seen from above, and how high it is there.
             edge = np.where(to_sun[:2] > 0, b.north_max, b.north_min)
             run = ((edge - p[:, :2]) / to_sun[:2]).min(axis=1)
             blocked = run * -to_sun[2] < b.height
             for i in range(len(scene.obstacles)):
                 blocked |= hidden(scene.obstacles, i, p, to_sun)
-            found = seen.rgb[floor][:, 0] == 0
+            found = seen.rgb[floor][::5, 0] == 0
             wrong += int((blocked != found).sum())
             dark_points, total = dark_points + int(found.sum()), total + len(p)
-    assert dark_points > 1000
+    assert dark_points > 200
     # Ways are sampled every centimetre: grazing ones miss a corner.
     assert wrong < 0.002 * total
 
