@@ -21,8 +21,8 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.latency.samplers import LatencySampler
 from airl_mav.latency.stamps import NO_STAMP, DecisionLog
 from airl_mav.policy.actions import Policy, limited, vertical_speed
-from airl_mav.policy.layouts import MOST_FRAMES
 from airl_mav.policy.observation import InFlight, Kinematics, Observation, observe
+from airl_mav.policy.observation_spec import MOST_FRAMES
 from airl_mav.prediction.compensator import Compensator
 from airl_mav.prediction.memory import DecisionMemory
 from airl_mav.scenario.model import PilotSettings

@@ -17,7 +17,8 @@ from airl_mav.envs.navigation import Flights, Navigation
 from airl_mav.envs.rewards import Step, costs, reward_of
 from airl_mav.envs.spec import Costs, EnvironmentSpec, gymnasium_spec
 from airl_mav.policy.action_sets import ActionSpec, commands, discrete_actions
-from airl_mav.policy.layouts import ObservationSpec, boxes
+from airl_mav.policy.layouts import boxes
+from airl_mav.policy.observation_spec import ObservationSpec
 
 FIRST_TRAINING_SEED = 1_000_000
 """Episodes that draw their own seed draw it from here on: those below are for evaluation."""

@@ -16,9 +16,10 @@ from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.flight.judge import Outcome
 from airl_mav.policy.action_sets import commands
 from airl_mav.policy.actions import Policy, limited
-from airl_mav.policy.layouts import Encoded, encode_layout
+from airl_mav.policy.layouts import encode_layout
 from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.policy.observation import Observation
+from airl_mav.policy.observation_spec import Encoded
 
 Decide = Callable[[Encoded], NDArray[Any]]
 """From the observations of n vehicles to their n actions; must treat each one for itself."""

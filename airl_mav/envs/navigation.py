@@ -51,8 +51,9 @@ from airl_mav.faults.model import Fault
 from airl_mav.faults.twin import check_twin
 from airl_mav.latency.injection import Injection
 from airl_mav.policy.actions import vertical_speeds
-from airl_mav.policy.layouts import Encoded, ObservationSpec, camera_mismatch, encode_layout
+from airl_mav.policy.layouts import encode_layout
 from airl_mav.policy.observation import Kinematics, Observation, Rows, observe
+from airl_mav.policy.observation_spec import Encoded, ObservationSpec, camera_mismatch
 from airl_mav.prediction.compensator import Compensator
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.conditions import Payload

@@ -14,7 +14,7 @@ from airl_mav.envs.experts import Expert
 from airl_mav.envs.saved_state import Stateful
 from airl_mav.envs.spec import ExpertName
 from airl_mav.envs.vector import NavigationVectorEnv
-from airl_mav.policy.layouts import Encoded
+from airl_mav.policy.observation_spec import Encoded
 
 QUALITY = ("success", "outcome", "flight_time_s", "distance_m", "energy_j", "seed", "zone")
 """Keys of `info` that go into SB3's `episode` info, beside return, length and time."""

@@ -21,7 +21,8 @@ from airl_mav.envs.fleet import Verdict
 from airl_mav.envs.navigation import Flights
 from airl_mav.envs.rendering import EpisodeRenderer, Window, display_found
 from airl_mav.envs.spec import EnvironmentSpec
-from airl_mav.policy.layouts import Encoded, newest_frame
+from airl_mav.policy.layouts import newest_frame
+from airl_mav.policy.observation_spec import Encoded
 
 
 class NavigationEnv(Decisions, gym.Env[Encoded, Any]):

@@ -13,7 +13,7 @@ from airl_mav.core.plugins import REWARDS, part_name
 from airl_mav.flight.judge import GOAL_RADIUS_M, TIME_LIMIT_S, GoalRadius, TimeLimit
 from airl_mav.policy.action_sets import PAPER_SPEED_M_S, ActionSetName, ActionSpec
 from airl_mav.policy.actions import DecisionTiming
-from airl_mav.policy.layouts import STRIP_ROWS, Frames, LayoutName, Told
+from airl_mav.policy.observation_spec import STRIP_ROWS, Frames, LayoutName, Told
 from airl_mav.profiles.camera_kind import CameraKind
 from airl_mav.profiles.conditions import SensorNoise, Spread, WindSettings
 from airl_mav.profiles.projection import CYLINDER_MOST_DEG, Projection, check_fov

@@ -33,7 +33,7 @@ from airl_mav.envs.saved_state import (
     unpack_generators,
 )
 from airl_mav.envs.spec import EnvironmentSpec, spec_of
-from airl_mav.policy.layouts import Encoded
+from airl_mav.policy.observation_spec import Encoded
 
 AHEAD = 32
 """Arenas that are made ahead at a time."""

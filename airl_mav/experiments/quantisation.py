@@ -28,9 +28,10 @@ from airl_mav.policy.card import (
     read_model,
 )
 from airl_mav.policy.card_writing import write_card
-from airl_mav.policy.layouts import Encoded, encode_layout
+from airl_mav.policy.layouts import encode_layout
 from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.policy.observation import Observation
+from airl_mav.policy.observation_spec import Encoded
 from airl_mav.policy.quantised import METHOD, quantised, relative_error
 from airl_mav.policy.runtime import OnnxRuntime
 from airl_mav.scenario.model import DEFAULT_ARENA, Scenario

@@ -20,8 +20,8 @@ from airl_mav.core.files import read_json
 from airl_mav.policy.action_sets import CONTINUOUS, ActionSpec
 from airl_mav.policy.action_sets import SHIPPED as SHIPPED_ACTION_SETS
 from airl_mav.policy.actions import DecisionTiming
-from airl_mav.policy.layouts import SHIPPED as SHIPPED_LAYOUTS
-from airl_mav.policy.layouts import ObservationSpec, camera_mismatch
+from airl_mav.policy.observation_spec import SHIPPED as SHIPPED_LAYOUTS
+from airl_mav.policy.observation_spec import ObservationSpec, camera_mismatch
 from airl_mav.policy.runtime import OnnxRuntime
 from airl_mav.profiles.vehicle import Camera
 

@@ -21,8 +21,9 @@ from airl_mav.policy.card import (
     read_card,
     read_torch_program,
 )
-from airl_mav.policy.layouts import ablated, boxes, camera_mismatch, encode_layout
+from airl_mav.policy.layouts import ablated, boxes, encode_layout
 from airl_mav.policy.observation import Observation
+from airl_mav.policy.observation_spec import camera_mismatch
 from airl_mav.policy.runtime import (
     Memory,
     RecurrentRuntime,

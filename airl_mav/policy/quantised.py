@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.core.errors import UsageError
-from airl_mav.policy.layouts import Encoded
+from airl_mav.policy.observation_spec import Encoded
 from airl_mav.policy.runtime import first_line
 
 METHOD = (

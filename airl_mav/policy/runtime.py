@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.policy.action_sets import ActionSpec, discrete_actions
-from airl_mav.policy.layouts import ObservationSpec, boxes
+from airl_mav.policy.layouts import boxes
+from airl_mav.policy.observation_spec import ObservationSpec
 
 RuntimeName = Literal["onnx", "torch"]
 

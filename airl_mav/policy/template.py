@@ -19,7 +19,8 @@ from airl_mav.core.files import replace_file
 from airl_mav.policy.action_sets import ActionSpec
 from airl_mav.policy.card import ONNX_FILE, PolicyCard, PolicyFacts, digest
 from airl_mav.policy.card_writing import write_card
-from airl_mav.policy.layouts import GOAL, VELOCITY, ObservationSpec
+from airl_mav.policy.layouts import GOAL, VELOCITY
+from airl_mav.policy.observation_spec import ObservationSpec
 from airl_mav.policy.runtime import ACTION, outputs_of
 
 OPSET = 18

@@ -12,9 +12,9 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.clock import WallClock, processor_time_us
 from airl_mav.core.progress import Bar
 from airl_mav.policy.actions import limited
-from airl_mav.policy.layouts import camera_mismatch
 from airl_mav.policy.learned import LearnedPolicy, open_network
 from airl_mav.policy.observation import Kinematics, encode
+from airl_mav.policy.observation_spec import camera_mismatch
 from airl_mav.profiling.measurement import Recording
 from airl_mav.profiling.policy_under_test import PolicyUnderTest
 from airl_mav.profiling.request import ProfileRequest

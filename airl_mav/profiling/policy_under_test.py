@@ -16,7 +16,7 @@ from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import validated
 from airl_mav.flight.judge import GOAL_RADIUS_M
 from airl_mav.policy.card import PolicyCard, PolicyFacts, vehicle_mismatch
-from airl_mav.policy.layouts import ObservationSpec, camera_mismatch
+from airl_mav.policy.observation_spec import ObservationSpec, camera_mismatch
 from airl_mav.policy.registry import find_policy
 from airl_mav.policy.template import write_template
 from airl_mav.profiles.computer import Network

@@ -25,9 +25,10 @@ from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.policy.action_sets import commands, discrete_actions
-from airl_mav.policy.layouts import MOST_FRAMES, encode_layout
+from airl_mav.policy.layouts import encode_layout
 from airl_mav.policy.learned import LearnedPolicy, load_learned
 from airl_mav.policy.observation import Earlier, InFlight, Kinematics, Observation, observe
+from airl_mav.policy.observation_spec import MOST_FRAMES
 from airl_mav.policy.registry import find_policy
 from airl_mav.prediction.compensator import Compensator
 from airl_mav.prediction.memory import DecisionMemory

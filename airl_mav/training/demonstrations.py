@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from airl_mav.policy.layouts import Encoded
+from airl_mav.policy.observation_spec import Encoded
 
 
 class Demonstrations:

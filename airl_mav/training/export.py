@@ -21,7 +21,8 @@ from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.plugins import MODELS, load_part
 from airl_mav.policy.action_sets import ActionSpec, discrete_actions
 from airl_mav.policy.card import PolicyCard, PolicyFacts
-from airl_mav.policy.layouts import GOAL, IN_FLIGHT, VELOCITY, ObservationSpec, boxes
+from airl_mav.policy.layouts import GOAL, IN_FLIGHT, VELOCITY, boxes
+from airl_mav.policy.observation_spec import ObservationSpec
 from airl_mav.policy.runtime import CONTINUOUS_OUTPUTS, first_line
 from airl_mav.profiles.camera_kind import CHANNELS, KINDS
 from airl_mav.training.export_request import ExportRequest, Taken

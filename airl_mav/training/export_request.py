@@ -18,7 +18,7 @@ from airl_mav.flight.judge import GOAL_RADIUS_M
 from airl_mav.policy.action_sets import PAPER_SPEED_M_S, ActionSetName, ActionSpec
 from airl_mav.policy.actions import DecisionTiming
 from airl_mav.policy.card import PolicyFacts, Training
-from airl_mav.policy.layouts import LayoutName, ObservationSpec
+from airl_mav.policy.observation_spec import LayoutName, ObservationSpec
 from airl_mav.profiles.camera_kind import CameraKind
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.projection import Projection

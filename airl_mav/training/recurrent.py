@@ -15,7 +15,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from torch import nn
 from torch.nn import functional
 
-from airl_mav.policy.layouts import GOAL, VELOCITY, Encoded
+from airl_mav.policy.layouts import GOAL, VELOCITY
+from airl_mav.policy.observation_spec import Encoded
 from airl_mav.policy.runtime import Shapes
 
 HIDDEN, CELL = "hidden", "cell"

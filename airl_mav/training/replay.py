@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.policy.layouts import Encoded
+from airl_mav.policy.observation_spec import Encoded
 
 RUNNING, TERMINATED, TRUNCATED = 0, 1, 2
 """Status of an episode after a step."""

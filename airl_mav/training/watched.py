@@ -24,7 +24,8 @@ from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.envs.trace import Trace
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.policy.action_sets import commands, discrete_actions
-from airl_mav.policy.layouts import Encoded, newest_frame
+from airl_mav.policy.layouts import newest_frame
+from airl_mav.policy.observation_spec import Encoded
 from airl_mav.training.store import Evaluation, TrainingProgress
 from airl_mav.view.ends import ViewEnds
 from airl_mav.view.feed import Feed

@@ -35,7 +35,8 @@ from airl_mav.core.progress import RichProgress
 from airl_mav.core.provenance import describe_machine, package_versions
 from airl_mav.latency.percentiles import MIN_SAMPLES, percentile
 from airl_mav.policy.action_sets import ActionSpec
-from airl_mav.policy.layouts import ObservationSpec, boxes
+from airl_mav.policy.layouts import boxes
+from airl_mav.policy.observation_spec import ObservationSpec
 from airl_mav.policy.runtime import OnnxRuntime, outputs_of
 from airl_mav.policy.template import Size, build_template, template_size
 from airl_mav.profiles.loading import load_profile

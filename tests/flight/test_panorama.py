@@ -21,8 +21,9 @@ from airl_mav.lockstep.flight import fly
 from airl_mav.policy.actions import Action
 from airl_mav.policy.greedy import GreedyPolicy
 from airl_mav.policy.images import NUMPY
-from airl_mav.policy.layouts import MOST_FRAMES, ObservationSpec, encode_layout
+from airl_mav.policy.layouts import encode_layout
 from airl_mav.policy.observation import Observation
+from airl_mav.policy.observation_spec import MOST_FRAMES, ObservationSpec
 from firmware_sim.plant.camera_server import SimulatedCamera
 from tests.support.lockstep_kit import demo_scenario
 

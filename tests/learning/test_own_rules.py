@@ -26,7 +26,8 @@ import numpy as np
 
 from airl_mav.arena.generate import local_bounds
 from airl_mav.arena.geometry import Arena, Obstacles, Shape
-from airl_mav.policy.layouts import Box, boxes, encode_layout
+from airl_mav.policy.layouts import boxes, encode_layout
+from airl_mav.policy.observation_spec import Box
 
 
 class Tilted:

@@ -18,9 +18,10 @@ from airl_mav.experiments.gym_flier import environment_of
 from airl_mav.flight.judge import Outcome
 from airl_mav.lockstep.flight import fly
 from airl_mav.policy.action_sets import ActionSpec, command, commands
-from airl_mav.policy.layouts import ObservationSpec, encode_layout
+from airl_mav.policy.layouts import encode_layout
 from airl_mav.policy.learned import LearnedPolicy, load_learned
 from airl_mav.policy.observation import Observation
+from airl_mav.policy.observation_spec import ObservationSpec
 from airl_mav.scenario.aircraft import Ports
 from airl_mav.training.export import export_sb3
 from airl_mav.training.recurrent import GreedyDecisions

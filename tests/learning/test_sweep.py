@@ -20,7 +20,8 @@ from airl_mav.core.fields import validated
 from airl_mav.core.provenance import provenance
 from airl_mav.experiments.store import load_campaign, open_campaign
 from airl_mav.policy.action_sets import ActionSpec
-from airl_mav.policy.layouts import ObservationSpec, boxes
+from airl_mav.policy.layouts import boxes
+from airl_mav.policy.observation_spec import ObservationSpec
 from airl_mav.policy.runtime import OnnxRuntime
 from airl_mav.policy.template import Size, build_template, template_size
 from airl_mav.profiles.computer import load_computer

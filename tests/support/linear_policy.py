@@ -16,7 +16,7 @@ from onnx import TensorProto, helper, numpy_helper
 from airl_mav.policy.action_sets import ActionSpec, commands
 from airl_mav.policy.card import CARD_FILE, ONNX_FILE, PolicyCard, PolicyFacts, Training, digest
 from airl_mav.policy.card_writing import write_card
-from airl_mav.policy.layouts import ObservationSpec
+from airl_mav.policy.observation_spec import ObservationSpec
 
 SPEC = ObservationSpec(height_px=24, width_px=32, horizontal_fov_deg=90.0, range_m=20.0)
 ACTIONS = ActionSpec(set="arc-25", max_speed_m_s=5.0)

@@ -18,7 +18,8 @@ from torch import nn
 
 from airl_mav.policy.action_sets import ActionSpec, discrete_actions
 from airl_mav.policy.card import PolicyCard, PolicyFacts
-from airl_mav.policy.layouts import Encoded, ObservationSpec, boxes, image_key
+from airl_mav.policy.layouts import boxes, image_key
+from airl_mav.policy.observation_spec import Encoded, ObservationSpec
 from airl_mav.training.config import NetworkSpec
 from airl_mav.training.export import export_sb3
 from airl_mav.training.networks import DepthExtractor, dense_units

@@ -9,7 +9,7 @@ import pytest
 
 from airl_mav.policy.action_sets import ActionSpec
 from airl_mav.policy.card import PolicyFacts, load_card
-from airl_mav.policy.layouts import ObservationSpec
+from airl_mav.policy.observation_spec import ObservationSpec
 from airl_mav.policy.runtime import OnnxRuntime
 from airl_mav.policy.template import build_template, template_size, write_template
 

@@ -1,0 +1,157 @@
+"""What a network sees of the world: which layout, of which camera, told of what else."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.core import plugins
+from airl_mav.core.fields import ProfileModel, quantity
+from airl_mav.policy.scans import goes_round
+from airl_mav.profiles.camera_kind import CHANNELS, CameraKind
+from airl_mav.profiles.projection import CYLINDER_MOST_DEG, Projection, check_fov
+
+SHIPPED = ("body", "paper", "scan")
+LayoutName = Annotated[str, plugins.part_name(plugins.LAYOUTS, SHIPPED)]
+Encoded = dict[str, NDArray[Any]]
+"""Arrays of a layout, by key."""
+
+Told = Literal["command", "latency", "age"]
+
+TOLD: dict[Told, int] = {"command": 3, "latency": 1, "age": 1}
+"""Numbers of each thing that a network may be told of the decisions."""
+
+STRIP_ROWS = 10
+"""`paper`: rows on top of the image that draw the bearing of the goal, the last one black."""
+
+SEAM_SHARE = 8
+"""`scan`: so many-th of the bearings of a camera that sees all round are repeated at either end, so
+that a convolution sees what is behind the vehicle in one piece."""
+
+MOST_FRAMES = 8
+"""Most images that a network sees at a time."""
+
+Frames = Annotated[
+    int,
+    quantity(
+        "images that the network sees: of this decision, and of so many less one before it",
+        "1",
+        ge=1,
+        le=MOST_FRAMES,
+    ),
+]
+
+
+class ObservationSpec(ProfileModel):
+    """What a network takes, and the camera that can provide it."""
+
+    layout: LayoutName = Field(default="body", description="which arrays it takes")
+    height_px: int = quantity("height of the image that the network sees", "px", ge=4, le=480)
+    width_px: int = quantity("width of the image that the network sees", "px", ge=4, le=640)
+    projection: Projection = Field(
+        default="pinhole",
+        description="how directions fall on the image: pinhole, or cylindrical for a field of view"
+        " of up to 360 deg",
+    )
+    horizontal_fov_deg: float = quantity(
+        "horizontal field of view, less than 170 with a pinhole",
+        "deg",
+        gt=10,
+        le=CYLINDER_MOST_DEG,
+    )
+    range_m: float = quantity(
+        "depth from which on everything looks far; rgb and grey images have no such depth",
+        "m",
+        gt=0.5,
+        le=65,
+    )
+    kind: CameraKind = Field(
+        default="depth",
+        description="what the camera gives, and the key of the image: depth, rgb or grey",
+    )
+    frames: Frames = 1
+    in_flight: tuple[Told, ...] = Field(
+        default=(),
+        description="what else the network is told: command, the newest setpoint; latency, the t2"
+        " that is expected; age, of the image",
+    )
+
+    @model_validator(mode="after")
+    def _camera_has_rows(self) -> ObservationSpec:
+        if self.camera_rows < 1:
+            raise ValueError(
+                f"height_px = {self.height_px}: accepted: more than {STRIP_ROWS}, the rows of "
+                "the strip of layout 'paper'"
+            )
+        if self.frames > 1 and self.layout == "paper":
+            raise ValueError(f"frames = {self.frames}: accepted: 1 with layout 'paper'")
+        if self.kind != "depth" and self.layout in ("paper", "scan"):
+            raise ValueError(f"kind = {self.kind!r}: accepted: 'depth' with layout {self.layout!r}")
+        check_fov("horizontal_fov_deg", self.projection, self.horizontal_fov_deg)
+        return self
+
+    @property
+    def camera_rows(self) -> int:
+        """Rows of the image that come from the camera."""
+        return self.height_px - (STRIP_ROWS if self.layout == "paper" else 0)
+
+    @property
+    def image_shape(self) -> tuple[int, int]:
+        """Rows and columns of the image as it goes into the network."""
+        if self.layout != "scan":
+            return self.height_px, self.width_px
+        return self.frames, self.width_px + 2 * self.seam
+
+    @property
+    def seam(self) -> int:
+        """Bearings of a scan that are repeated at either end."""
+        whole = self.layout == "scan" and goes_round(math.radians(self.horizontal_fov_deg))
+        return self.width_px // SEAM_SHARE if whole else 0
+
+    @property
+    def channels(self) -> int:
+        """Channels of the image that the network sees: those of a frame, for each frame."""
+        return 1 if self.layout == "scan" else CHANNELS[self.kind] * self.frames
+
+
+class Box(NamedTuple):
+    """Shape, type and bounds of one array of a layout, without the leading axis."""
+
+    shape: tuple[int, ...]
+    dtype: type[np.generic]
+    low: float
+    high: float
+
+
+def camera_mismatch(spec: ObservationSpec, camera: Intrinsics) -> str | None:
+    """Return why a camera cannot serve a layout, or None when it can.
+
+    It gives what the network takes, its image is a whole multiple of the network's, projection and
+    field of view are the same.
+    """
+    if camera.kind != spec.kind:
+        return f"{camera.kind} camera; accepted: {spec.kind}"
+    rows, columns = spec.camera_rows, spec.width_px
+    if (
+        camera.width % columns
+        or camera.height % rows
+        or camera.width * rows != (camera.height * columns)
+    ):
+        return (
+            f"camera {camera.width}x{camera.height} px; accepted: {columns}x{rows} px "
+            "or a whole multiple"
+        )
+    if camera.projection != spec.projection:
+        return f"{camera.projection} camera; accepted: {spec.projection}"
+    fov_deg = math.degrees(camera.horizontal_fov_rad)
+    if abs(fov_deg - spec.horizontal_fov_deg) > 0.1:
+        return (
+            f"camera with a horizontal field of view of {fov_deg:.1f} deg; "
+            f"accepted: {spec.horizontal_fov_deg:.1f} deg"
+        )
+    return None
