@@ -23,6 +23,7 @@ SHIPPED: dict[str, tuple[str, str]] = {
     "dynamic-obstacles-fast": ("dynamic-obstacles-fast", "run"),
     "dense-obstacles": ("generalisation", "dense-obstacles-dense-obstacles"),
     "dense-obstacles-fast": ("dense-obstacles-fast", "run"),
+    "dense-obstacles-d435": ("dense-obstacles-d435", "run"),
     "crowded": ("generalisation", "crowded-crowded"),
     "crowded-pipelined": ("crowded-pipelined", "run"),
     "crowded-fast": ("crowded-fast", "run"),
