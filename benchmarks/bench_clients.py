@@ -195,7 +195,7 @@ class Pacing:
         return now_us
 
     def read_by(self, began_us: int) -> int:
-        return began_us
+        return self._wall.read_by(began_us)
 
     def end_tick(self) -> None:
         """Note the processor time since the tick began."""

@@ -89,7 +89,8 @@ class WallPacing:
     def wait(self, tick_us: int, sockets: Sequence[int], readable: Callable[[int], object]) -> int:
         """Wait until the wall time of simulated `tick_us`; return the time then [µs].
 
-        What arrives early is handled at once, stamped with its own time, and waits for the tick.
+        What arrives early is handled at once, stamped with its own time, and waits for the tick; in
+        the last moments before it (`READ_AFTER_S`) it is left to be read then.
         Every time handed out is read once and checked for lag first: a process that was stopped
         while it waited must not stamp what has arrived with a time that is about to be given up.
         """
