@@ -18,16 +18,25 @@ from firmware_sim.autopilot.yaw_estimator import YawEstimator
 CONVERGED_RAD = 0.262
 """The yaw estimator is asked only where it is as sure as this (EKFGSF_yaw_err_max), 15°."""
 
+SURE_RAD = math.radians(10.0)
+"""Where biases of the inertial sensors may be what is wrong it has to be as sure as this. PX4 has
+no such biases."""
+
 FAILED_RAD = math.radians(25.0)
 """A heading that differs by more has failed."""
 
 REFUSED_US = US_PER_S
 """GPS velocities have to be refused for so long (EKFGSF_reset_delay) [µs]."""
 
+DOUBTED_US = 2 * US_PER_S
+"""A doubt lasts so long: meanwhile the yaw estimator may become sure [µs]."""
 
 SUSPECTED_SIGMA = 3.0
-"""Before the yaw estimator is sure, a heading so many of its standard deviations off is suspected:
-it explains what biases of the inertial sensors would explain otherwise. PX4 has no such biases."""
+"""A heading so many of the yaw estimator's standard deviations off is suspected."""
+
+EXPLAINED = 0.97
+"""A heading is to blame where another one explains more than this share of the disagreement. What
+a gyro's error does, which tilts the filter and the yaw estimator alike, leaves more of it."""
 
 
 class EmergencyYaw:
@@ -40,8 +49,10 @@ class EmergencyYaw:
 
     def is_suspected(self, state: Vector, yaw: YawEstimator) -> bool:
         """Return whether the nominal state's heading is likely to be another one."""
-        off = abs(math.remainder(yaw.yaw - yaw_of(es.attitude(state)), 2.0 * math.pi))
-        return off > max(FAILED_RAD, SUSPECTED_SIGMA * math.sqrt(yaw.variance))
+        heading = yaw_of(es.attitude(state))
+        off = abs(math.remainder(yaw.yaw - heading, 2.0 * math.pi))
+        apart = off > max(FAILED_RAD, SUSPECTED_SIGMA * math.sqrt(yaw.variance))
+        return apart and yaw.explained(heading) > EXPLAINED
 
     def doubt(self, time_us: int) -> None:
         """Note that something must be wrong, and that the heading may be."""
@@ -56,8 +67,9 @@ class EmergencyYaw:
             fused_us: When a GPS velocity was last within the gate; None = never.
         """
         refused = fused_us is not None and time_us - fused_us >= REFUSED_US
-        doubted = self._doubted_us is not None and time_us - self._doubted_us <= REFUSED_US
-        return (refused or doubted) and yaw.variance < CONVERGED_RAD**2
+        doubted = self._doubted_us is not None and time_us - self._doubted_us <= DOUBTED_US
+        sigma = math.sqrt(yaw.variance)
+        return (refused and sigma < CONVERGED_RAD) or (doubted and sigma < SURE_RAD)
 
 
 def turn_to(state: Vector, covariance: Vector, yaw: float, variance: float) -> Vector:

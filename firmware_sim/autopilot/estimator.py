@@ -104,6 +104,8 @@ class Estimator:
         """Whether the vehicle is in the air; set by whoever knows."""
         self.emergency = EmergencyYaw()
         """When it is taken over."""
+        self._biases_before = self.state[es.GYRO_BIAS : es.BARO_OFFSET].copy()
+        """Of gyro and accelerometer (6,), before these were doubted."""
         self._field: Vector | None = None
         """The newest that the compass has measured (3,) FRD [gauss]; before alignment the mean."""
 
@@ -280,9 +282,7 @@ class Estimator:
         self._observe_yaw(fix.velocity_ned, math.sqrt(r_v))
         r_v, restart = self._check_velocity(fix.velocity_ned - self._then()[3:], r_v)
         self._answer(restart)
-        if self._suspects_heading and self.emergency.is_due(
-            self._time_us, self.yaw, self._gps_horizontal.fused_us
-        ):
+        if self._heading_is_due and self._suspects_heading:
             self._reset_heading(measured, fix.velocity_ned, r_p, r_v)
         m, then = self._gps_horizontal, self._then()
         m.innovation[:2] = measured[:2] - then[:2]
@@ -341,21 +341,33 @@ class Estimator:
         return variance * excess, restart
 
     @property
+    def _heading_is_due(self) -> bool:
+        return self.emergency.is_due(self._time_us, self.yaw, self._gps_horizontal.fused_us)
+
+    @property
     def _suspects_heading(self) -> bool:
         return self.flying and self.emergency.is_suspected(self.state, self.yaw)
 
     def _answer(self, restart: Restart | None) -> None:
-        """Restart the filter, unless the heading explains what it would be restarted for."""
+        """Restart the filter, unless the heading is given up for the same reason."""
         if restart is None:
             return
         if self._suspects_heading:
             self.emergency.doubt(self._time_us)
-        else:
-            self._restart(restart)
+            if self._heading_is_due:
+                return
+        self._restart(restart)
 
     def _reset_heading(self, place: Vector, velocity: Vector, r_p: float, r_v: float) -> None:
-        """Take over the yaw estimator's heading and the GPS's motion, and give up the compass."""
+        """Take over the yaw estimator's heading and the GPS's motion, and give up the compass.
+
+        What a restart has let the filter learn meanwhile, in tilt and biases, goes with it.
+        """
         state, then = self.state, self._then().copy()
+        if self.doubts_inertial(self._time_us):
+            # The inertial sensors were doubted for what the heading did.
+            state[es.GYRO_BIAS : es.BARO_OFFSET] = self._biases_before
+            state[es.Q : es.RATES] = self.yaw.attitude
         covariance = turn_to(state, self.filter.covariance, self.yaw.yaw, self.yaw.variance)
         state[es.P : es.P + 2] += place[:2] - then[:2]
         state[es.V : es.Q] += velocity - then[3:]
@@ -369,6 +381,8 @@ class Estimator:
 
     def _restart(self, restart: Restart) -> None:
         """Let the filter learn anew what inertial sensors make wrong."""
+        if not self.doubts_inertial(self._time_us):
+            self._biases_before = self.state[es.GYRO_BIAS : es.BARO_OFFSET].copy()
         self.consistency.restarted(self._time_us)
         variances = self.filter.covariance.diagonal().copy()
         for first, sigma in (

@@ -16,7 +16,9 @@ the variance of the velocity where it takes a standard deviation; here it is giv
 
 from __future__ import annotations
 
+import cmath
 import math
+from collections import deque
 
 import numpy as np
 
@@ -75,9 +77,16 @@ X, YAW, P_NN, P_NE, P_NY, P_EE, P_EY, P_YY, ATTITUDE, BIAS, WEIGHT = (
 MODEL_SIZE = 17
 
 # What the models share: smoothed specific force (3) [m/s²], whether the tilt is aligned, whether
-# velocities are fused, and the result: heading [rad] and its variance [rad²].
-FORCE, ALIGNED, STARTED, RESULT, VARIANCE = 0, 3, 4, 5, 6
-SHARED_SIZE = 7
+# velocities are fused, the result: heading [rad] and its variance [rad²]; and the velocity by the
+# IMU alone (2) [m/s], along a heading that differs from the first model's by what GPS turned that.
+FORCE, ALIGNED, STARTED, RESULT, VARIANCE, FELT, TURNED = 0, 3, 4, 5, 6, 7, 9
+SHARED_SIZE = 10
+
+EXCUSED = 2.0
+"""This many times what the noise of GPS does is no disagreement: the models drift too."""
+
+WINDOW = 20
+"""Fixes over which what is felt is held against what GPS sees: 2 s at 10 Hz."""
 
 LONGEST = 64
 """Samples of the IMU that are kept until they are predicted: 0.25 s."""
@@ -137,11 +146,11 @@ def _level(m: Vector, gyro: Vec, force: Vec, dt: float) -> None:
 
 
 @kernel
-def _predict(m: Vector, accel: Vec, dt: float) -> None:
+def _predict(m: Vector, accel: Vec, dt: float) -> tuple[float, float]:
     """Move a model's velocity and heading, and their covariance P = F P F' + Q.
 
     Of F only the column of the heading differs from the identity's: a heading error turns the
-    change of velocity.
+    change of velocity, which is returned (north, east).
     """
     q = _quat(m)
     m[YAW] = yaw_of(q)
@@ -157,6 +166,15 @@ def _predict(m: Vector, accel: Vec, dt: float) -> None:
     m[P_YY] = max(m[P_YY] + (GYRO_NOISE * dt) ** 2, LEAST_VARIANCE)
     m[X] += north
     m[X + 1] += east
+    return north, east
+
+
+@kernel
+def _feel(shared: Vector, north: float, east: float) -> None:
+    """Add a change of the first model's velocity, turned back by what GPS has turned the model."""
+    c, s = math.cos(shared[TURNED]), math.sin(shared[TURNED])
+    shared[FELT] += c * north + s * east
+    shared[FELT + 1] += c * east - s * north
 
 
 @large_kernel
@@ -192,7 +210,9 @@ def advance(models: Vector, shared: Vector, gyro: Vector, accel: Vector, dt: flo
         for j in range(N_MODELS):
             _level(models[j], w, force, dt)
             if shared[STARTED] != 0.0:
-                _predict(models[j], a, dt)
+                north, east = _predict(models[j], a, dt)
+                if j == 0:
+                    _feel(shared, north, east)
 
 
 @kernel
@@ -209,6 +229,7 @@ def _start(models: Vector, shared: Vector, north: float, east: float, variance: 
         m[P_YY] = (0.5 * step) ** 2
         m[WEIGHT] = 1.0 / N_MODELS
     shared[STARTED], shared[RESULT], shared[VARIANCE] = 1.0, 0.0, (0.5 * math.pi) ** 2
+    shared[FELT:] = 0.0
 
 
 @kernel
@@ -257,11 +278,12 @@ def fuse(models: Vector, shared: Vector, north: float, east: float, accuracy: fl
     if shared[STARTED] == 0.0:
         _start(models, shared, north, east, variance)
         return
-    total = 0.0
+    total, before = 0.0, models[0, YAW]
     for j in range(N_MODELS):
         density = _correct(models[j], north, east, variance)
         models[j, WEIGHT] = max(models[j, WEIGHT] * density, LEAST_WEIGHT)
         total += models[j, WEIGHT]
+    shared[TURNED] += models[0, YAW] - before
     ahead = aside = 0.0
     for j in range(N_MODELS):
         m = models[j]
@@ -283,10 +305,17 @@ class YawEstimator:
 
     Samples of the IMU are kept until a fix needs them: predicting them together costs a tenth of
     predicting each at its time, and comes to the same.
+
+    Whether a heading is what is wrong tells the motion that the IMU feels: under a wrong heading it
+    is what GPS sees, turned about the vertical, equally large and at an angle that stays. A wrong
+    tilt or gyro gives the two nothing in common (`explained`).
     """
 
     def __init__(self) -> None:
         """Begin without a tilt."""
+        self._felt: deque[complex] = deque(maxlen=WINDOW)
+        self._seen: deque[complex] = deque(maxlen=WINDOW)
+        self._seen_variance = 0.0
         self.models = np.zeros((N_MODELS, MODEL_SIZE))
         """(N_MODELS, MODEL_SIZE)"""
         self.models[:, ATTITUDE] = 1.0
@@ -304,6 +333,11 @@ class YawEstimator:
     def variance(self) -> float:
         """Of the heading [rad²]; infinite before velocities are fused."""
         return self._shared.item(VARIANCE)
+
+    @property
+    def attitude(self) -> Vector:
+        """Of the likeliest model (4,), body to world, wxyz; its tilt is that of all of them."""
+        return self.models[int(np.argmax(self.models[:, WEIGHT])), ATTITUDE:BIAS].copy()
 
     def feel(self, gyro: Vector, accel: Vector) -> None:
         """Take a tick's sample of the IMU, each (3,) FRD [rad/s], [m/s²]; kept, not copied."""
@@ -326,9 +360,44 @@ class YawEstimator:
         self._advance()
         if flying:
             fuse(self.models, self._shared, velocity.item(0), velocity.item(1), accuracy)
+            self._felt.append(complex(*self._shared[FELT : FELT + 2].tolist()))
+            self._seen.append(complex(*velocity[:2].tolist()))
+            self._seen_variance = accuracy**2
             return
+        self._felt.clear()
+        self._seen.clear()
         self._shared[STARTED], self._shared[VARIANCE] = 0.0, math.inf
         self.models[:, BIAS : BIAS + 3] = gyro_bias
+
+    def explained(self, yaw: float) -> float:
+        """Return how much of what GPS and a heading disagree in, another heading would explain.
+
+        Velocities over the newest `WINDOW` fixes are complex numbers less their means, u as the IMU
+        felt them under that heading and w as GPS saw them. Of the sums of squares
+
+            as they are  sum |w - u|^2             = |w|^2 + |u|^2 - 2 Re(u* w)
+            best turned  min sum |w - e^(i a) u|^2 = |w|^2 + |u|^2 - 2 |u* w|
+
+        `EXCUSED` times what the noise of GPS does is taken off. Source: G. Wahba, A Least Squares
+        Estimate of Satellite Attitude (SIAM Review 7(3), 1965), in the plane.
+
+        Args:
+            yaw: A heading [rad].
+
+        Returns:
+            Share, 0 to 1; 0 where they do not disagree.
+        """
+        if not self._seen:
+            return 0.0
+        along = self.models.item(0, YAW) - self._shared.item(TURNED)
+        u, w = np.array(self._felt) * cmath.exp(1j * (yaw - along)), np.array(self._seen)
+        u, w = u - u.mean(), w - w.mean()
+        common = complex(np.vdot(u, w))
+        power = float(np.vdot(u, u).real + np.vdot(w, w).real)
+        rest = power - 2.0 * EXCUSED * self._seen_variance * len(w)
+        turned = max(rest - 2.0 * abs(common), 0.0)
+        as_they_are = rest - 2.0 * common.real
+        return 1.0 - turned / as_they_are if as_they_are > turned else 0.0
 
     def _advance(self) -> None:
         if self._gyro:

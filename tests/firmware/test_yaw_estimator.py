@@ -12,12 +12,13 @@ from scipy.spatial.transform import Rotation
 
 from airl_mav.core.constants import GRAVITY_M_S2, TICK_S
 from airl_mav.core.frames import quat_wxyz_to_xyzw, quat_yaw
+from airl_mav.experiments.fault_flight import fly_fault
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.autopilot_state import Mode
 from firmware_sim.autopilot.commander import Phase
-from firmware_sim.autopilot.emergency_yaw import EmergencyYaw, turn_to
+from firmware_sim.autopilot.emergency_yaw import EXPLAINED, EmergencyYaw, turn_to
 from firmware_sim.autopilot.yaw_estimator import WEIGHT, YAW, YawEstimator
-from tests.support.flight_rig import Rig, flight, velocity_setpoint
+from tests.support.flight_rig import Rig, flight, quad, velocity_setpoint
 
 ACCURACY = 0.05
 """Of the GPS velocity [m/s]: EKF2_GPS_V_NOISE of the shipped vehicle."""
@@ -98,6 +99,36 @@ def test_it_finds_the_heading_wherever_the_vehicle_points(ticks: list[Tick], ang
     assert sure[-75:].all(), "and all of the way, once it has accelerated"
     assert off[sure].max() < 25.0, "what is taken over is never as wrong as what is given up"
     assert off[-50:].mean() < 8.0
+
+
+@pytest.mark.parametrize(
+    ("off_deg", "least"), [(30.0, 0.9), (90.0, EXPLAINED), (180.0, EXPLAINED)]
+)
+def test_a_wrong_heading_is_explained_by_another(
+    ticks: list[Tick], off_deg: float, least: float
+) -> None:
+    """What it takes of 2 s of motion does not depend on where GPS has turned the models to."""
+    wrong = [
+        estimator.explained(tick.yaw + math.radians(off_deg))
+        for tick, estimator in observed(turned(ticks, 1.0))
+        if tick.flying and np.std(estimator._seen) > 0.9
+    ]
+    assert len(wrong) > 10
+    assert min(wrong) > least
+
+
+def test_a_tilt_is_not_explained_by_a_heading() -> None:
+    """The vehicle goes off at 1 m/s² where the IMU feels none: no direction makes it so."""
+    estimator = YawEstimator()
+    rng = np.random.default_rng(3)
+    for tick in range(1000):
+        accel = np.array([0.0, 0.0, -GRAVITY_M_S2]) + 0.05 * rng.standard_normal(3)
+        estimator.feel(0.002 * rng.standard_normal(3), accel)
+        if tick % 25 == 0:
+            north = max(tick * TICK_S - 2.0, 0.0)
+            velocity = np.array([north, 0.0, 0.0]) + 0.03 * rng.standard_normal(3)
+            estimator.observe(velocity, ACCURACY, np.zeros(3), flying=tick > 250)
+    assert all(estimator.explained(yaw) < 0.5 for yaw in np.linspace(-3.0, 3.0, 7))
 
 
 def test_standing_still_says_nothing() -> None:
@@ -239,24 +270,45 @@ def test_a_heading_is_taken_over_without_the_tilt(yaw: float) -> None:
     assert np.linalg.eigvalsh(after).min() > 0.0
 
 
+class Told(YawEstimator):
+    """One that has come to a heading, and to how much of the motion that explains."""
+
+    def __init__(self, off_deg: float, sigma_deg: float, explained: float) -> None:
+        super().__init__()
+        self._shared[5:7] = math.radians(off_deg), math.radians(sigma_deg) ** 2
+        self._explained = explained
+
+    def explained(self, yaw: float) -> float:
+        return self._explained
+
+
 @pytest.mark.parametrize(
-    ("off_deg", "sigma_deg", "suspected"),
-    [(24.0, 1.0, False), (26.0, 1.0, True), (26.0, 9.0, False), (180.0, 50.0, True)],
+    ("off_deg", "sigma_deg", "explained", "suspected"),
+    [
+        (24.0, 1.0, 1.0, False),
+        (26.0, 1.0, 1.0, True),
+        (26.0, 9.0, 1.0, False),
+        (180.0, 50.0, 1.0, True),
+        (180.0, 5.0, 0.95, False),
+    ],
 )
-def test_a_heading_is_suspected_that_is_off_by_far(
-    off_deg: float, sigma_deg: float, suspected: bool
+def test_a_heading_is_suspected_that_is_off_by_far_and_explains_the_motion(
+    off_deg: float, sigma_deg: float, explained: float, suspected: bool
 ) -> None:
-    yaw = YawEstimator()
-    yaw._shared[5:7] = math.radians(off_deg), math.radians(sigma_deg) ** 2
-    emergency = EmergencyYaw()
-    assert emergency.is_suspected(es.new_state(), yaw) is suspected
-    assert not emergency.is_suspected(es.new_state(), YawEstimator()), "nothing is known"
-    # It is given up where velocities have been refused for a second, and the other one is sure.
-    sure = sigma_deg < 15.0
+    yaw = Told(off_deg, sigma_deg, explained)
+    assert EmergencyYaw().is_suspected(es.new_state(), yaw) is suspected
+    assert not EmergencyYaw().is_suspected(es.new_state(), YawEstimator()), "nothing is known"
+
+
+@pytest.mark.parametrize(("sigma_deg", "refused", "doubted"), [(9, 1, 1), (12, 1, 0), (16, 0, 0)])
+def test_it_is_given_up_for_one_that_is_sure(sigma_deg: float, refused: int, doubted: int) -> None:
+    """Surer where the inertial sensors may be to blame instead; a doubt waits 2 s for it."""
+    yaw, emergency = Told(90.0, sigma_deg, 1.0), EmergencyYaw()
     assert not emergency.is_due(10_000_000, yaw, 9_100_000)
-    assert emergency.is_due(10_000_000, yaw, 9_000_000) is sure
+    assert emergency.is_due(10_000_000, yaw, 9_000_000) == bool(refused)
     emergency.doubt(10_500_000)
-    assert emergency.is_due(11_000_000, yaw, 10_900_000) is sure
+    assert emergency.is_due(12_500_000, yaw, 12_400_000) == bool(doubted)
+    assert not emergency.is_due(12_600_000, yaw, 12_500_000)
 
 
 def heading_error_deg(rig: Rig) -> float:
@@ -280,7 +332,26 @@ def test_a_compass_that_is_wrong_from_the_start_is_survived(bias: str) -> None:
         rig.ap.set_mode(Mode.LAND)
         rig.until(lambda: rig.ap.flight.phase is Phase.STANDBY, 30.0)
         assert max(hit.speed_m_s for hit in rig.sim.plant.collisions) < 1.0
-        assert math.isnan(rig.said("Estimator biases reset"))
+
+
+@pytest.mark.parametrize("seed", [18, 136])
+def test_a_gyro_that_tilts_it_too_leaves_a_right_heading_alone(seed: int) -> None:
+    """In the climb the vehicle leans against where it goes: as if it pointed backwards."""
+    flown = fly_fault(quad(), "gyro bias 2,2,2deg/s", "climb", seed)
+    assert flown.end == "landed"
+    assert "Estimator biases reset: IMU and GNSS disagree" in flown.said
+    assert "Compass needs calibration - Land now!" not in flown.said
+
+
+def test_a_heading_that_was_taken_for_biases_takes_them_along() -> None:
+    """The yaw estimator is not sure yet when the filter is restarted; then it is."""
+    with flight(310, faults=("mag bias -0.4,0,0gauss",)) as rig:
+        rig.take_off(5.0, settle_s=3.0)
+        estimator = rig.ap.estimator
+        assert (estimator.consistency.restarts, estimator.emergency.resets) == (1, 1)
+        assert abs(heading_error_deg(rig)) < 10.0
+        assert np.abs(estimator.state[es.GYRO_BIAS : es.ACCEL_BIAS]).max() < math.radians(1.0)
+        assert np.abs(estimator.state[es.ACCEL_BIAS : es.BARO_OFFSET]).max() < 0.3
 
 
 def test_a_healthy_compass_is_never_doubted() -> None:
