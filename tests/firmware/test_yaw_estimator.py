@@ -101,9 +101,7 @@ def test_it_finds_the_heading_wherever_the_vehicle_points(ticks: list[Tick], ang
     assert off[-50:].mean() < 8.0
 
 
-@pytest.mark.parametrize(
-    ("off_deg", "least"), [(30.0, 0.9), (90.0, EXPLAINED), (180.0, EXPLAINED)]
-)
+@pytest.mark.parametrize(("off_deg", "least"), [(30.0, 0.9), (90.0, EXPLAINED), (180.0, EXPLAINED)])
 def test_a_wrong_heading_is_explained_by_another(
     ticks: list[Tick], off_deg: float, least: float
 ) -> None:
