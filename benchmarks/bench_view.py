@@ -58,8 +58,8 @@ from airl_mav.view.handshake import Request  # noqa: E402
 from airl_mav.view.messages import (  # noqa: E402
     ArenaShown,
     Decided,
-    Depth,
     Episode,
+    Image,
     Picture,
     Vehicle,
     VehicleShape,
@@ -154,7 +154,7 @@ class Circle:
         camera = self.vehicle.camera
         mount = Mount((camera.forward_m, 0.0, -camera.up_m), np.deg2rad(camera.pitch_up_deg))
         intrinsics = Intrinsics.of(camera)
-        self._images: list[Depth] = []
+        self._images: list[Image] = []
         for k in range(64):
             position, quaternion = self.pose(k * DECISION_US)[:2]
             at, attitude = camera_pose(position, quaternion, mount)
