@@ -38,16 +38,19 @@ sys.meta_path.insert(0, Absent())
 """
 
 EVERY_MODULE = """
-import importlib, importlib.util, pkgutil
+import importlib, pkgutil
 import companion
 names = [m.name for m in pkgutil.walk_packages(companion.__path__, "companion.")]
 assert len(names) >= 5, names
-# Drivers that come with an extra.
+# Drivers that come with an extra, which may want a library of the system.
 for driver, needs in (
     ("oak_d", ["depthai"]), ("realsense", ["pyrealsense2"]),
     ("ros2", ["cyclonedds", "rosbags"]), ("rosbag", ["rosbags"]),
 ):
-    if None in map(importlib.util.find_spec, needs):
+    try:
+        for needed in needs:
+            importlib.import_module(needed)
+    except ImportError:
         names.remove(f"companion.cameras.{driver}")
 for name in names:
     importlib.import_module(name)
