@@ -351,6 +351,7 @@ def _fail(message: str) -> None:
 EXTRAS = {
     "black-box": ("mcap",),
     "export": ("foxglove", "mcap"),
+    "film": ("av",),
     "profile": ("onnx",),
     "refit": ("mcap", "pyulog"),
     "render": ("mitsuba",),

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -20,23 +22,34 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.frames import quat_from_euler
+from airl_mav.core.progress import RichProgress
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.projection import Projection, check_fov
 from airl_mav.rehearsal.run_folder import load
 from airl_mav.report.arenas import trust_arenas
-from airl_mav.report.camera_pictures import FILMS, Shown, film, still, write_film, write_png
+from airl_mav.report.camera_pictures import (
+    FILMS,
+    VIDEO,
+    Drawn,
+    Shown,
+    film,
+    moments,
+    still,
+    write_film,
+    write_png,
+)
 from airl_mav.report.replay.runs import ReplayedRun
 from airl_mav.scenario.model import DEFAULT_ARENA, GREATEST_SEED
 
 SAMPLES = {"raycast": 16, "mitsuba": 64}
 
-FILM_SAMPLES = 4
+FILM_SAMPLES = {"raycast": 4, "mitsuba": 16}
 
 STILL_PX, FILM_PX = (960, 640), (384, 256)
 
 OF_AN_ARENA = (
-    *("seed", "renderer", "north_m", "east_m", "height_m", "yaw_deg", "pitch_up_deg"),
+    *("seed", "north_m", "east_m", "height_m", "yaw_deg", "pitch_up_deg"),
     *("time_s", "vehicle_width_m"),
 )
 """Options that a flight has no use for: it has its own."""
@@ -55,6 +68,7 @@ class RenderOptions(ProfileModel):
         airl render dense-obstacles --show segmentation --out seen.png
         airl render dense-obstacles --renderer mitsuba --samples 256
         airl render runs/A 7 --out flight.gif
+        airl render runs/A 7 --renderer mitsuba --out flight.mp4
     """
 
     subject: Annotated[str, POSITIONAL] = Field(
@@ -75,7 +89,7 @@ class RenderOptions(ProfileModel):
         default="raycast", description="what draws; mitsuba draws rgb alone, without fog"
     )
     samples: int | None = quantity(
-        "rays or paths a pixel; by default 16, in a film 4, of mitsuba 64; a camera has one",
+        "rays or paths a pixel; by default 16, of mitsuba 64, in a film 4 and 16; a camera has one",
         "1",
         ge=1,
         le=4096,
@@ -83,8 +97,8 @@ class RenderOptions(ProfileModel):
     )
     out: Path | None = Field(
         default=None,
-        description="the file to write: .png of an arena, .gif or .webp of a flight; by default"
-        " render.png or render.gif",
+        description="the file to write: .png of an arena; .gif, .mp4 or .webp of a flight; by"
+        " default render.png or render.gif",
     )
     rate_hz: float = quantity(
         "pictures a second of a film, rounded to steps of 10 ms", "Hz", ge=1, le=50, default=10.0
@@ -147,7 +161,7 @@ def run(options: RenderOptions, console: Console | None = None) -> int:
     _check(options, filmed)
     out = options.out or Path("render.gif" if filmed else "render.png")
     try:
-        told = _film(options, path, out) if filmed else _picture(options, out)
+        told = _film(options, path, out, console) if filmed else _picture(options, out)
     except OSError as error:
         problem = f"cannot write: {error.strerror}"
         raise FieldError("out", f"{out}", problem=problem) from None
@@ -164,9 +178,11 @@ def _check(options: RenderOptions, filmed: bool) -> None:
             raise FieldError(name, value, problem=f"not for the picture of {subject}")
     suffixes = FILMS if filmed else (".png",)
     if options.out is not None and options.out.suffix.lower() not in suffixes:
-        names = " or ".join(suffixes)
+        names = " or ".join(", ".join(suffixes).rsplit(", ", 1))
         raise FieldError("out", f"{options.out}", f"a file name that ends in {names}")
     check_fov("fov_deg", options.projection, options.fov_deg)
+    if options.out is not None and options.out.suffix.lower() == VIDEO:
+        check_installed("film")
     if options.renderer == "mitsuba":
         check_installed("render")
         if options.show != "rgb":
@@ -179,9 +195,15 @@ def _camera(options: RenderOptions, size: tuple[int, int]) -> Intrinsics:
     return Intrinsics.from_fov(width, height, math.radians(options.fov_deg), options.projection)
 
 
-def _rays(samples: int) -> int:
-    """Return the rays of a pixel, each way, for so many of them."""
-    return math.ceil(math.sqrt(samples))
+def _drawn(options: RenderOptions, samples: int) -> Drawn:
+    """Return what draws, with so many rays or paths a pixel."""
+    if options.renderer == "mitsuba":
+        # Imported here: what it draws with is an extra.
+        from airl_mav.camera.mitsuba import path_traced
+
+        return partial(path_traced, samples=samples)
+    rays = math.ceil(math.sqrt(samples))
+    return partial(still, show=options.show, rays=rays, range_m=options.range_m)
 
 
 def _picture(options: RenderOptions, out: Path) -> str:
@@ -198,32 +220,29 @@ def _picture(options: RenderOptions, out: Path) -> str:
     pitch, yaw = math.radians(options.pitch_up_deg), math.radians(options.yaw_deg)
     centers = arena.centers_at(round(options.time_s * US_PER_S))
     camera = _camera(options, STILL_PX)
-    pose = (arena, centers, camera, position, quat_from_euler(0.0, pitch, yaw))
-    samples = options.samples or SAMPLES[options.renderer]
-    if options.renderer == "mitsuba":
-        # Imported here: what it draws with is an extra.
-        from airl_mav.camera.mitsuba import path_traced
-
-        write_png(out, path_traced(*pose, samples=samples))
-    else:
-        rays = _rays(samples)
-        write_png(out, still(*pose, options.show, rays=rays, range_m=options.range_m))
+    drawn = _drawn(options, options.samples or SAMPLES[options.renderer])
+    write_png(out, drawn(arena, centers, camera, position, quat_from_euler(0.0, pitch, yaw)))
     return "picture"
 
 
-def _film(options: RenderOptions, path: Path, out: Path) -> str:
+def _film(options: RenderOptions, path: Path, out: Path, console: Console) -> str:
     """Write the film of a flight; return what was written."""
     folder = folder_of(path)
     if options.trust:
         trust_arenas(load(folder))
     run = ReplayedRun(folder)
     record = run.records[0] if options.flight is None else run.record(options.flight)
-    pictures = film(
-        run.flight(record),
-        _camera(options, FILM_PX),
-        options.show,
-        rate_hz=options.rate_hz,
-        rays=_rays(options.samples or FILM_SAMPLES),
-        range_m=options.range_m,
-    )
-    return f"film of flight {record.index}, {write_film(out, pictures, options.rate_hz)} pictures"
+    drawn = _drawn(options, options.samples or FILM_SAMPLES[options.renderer])
+    camera = _camera(options, FILM_PX)
+    flight = run.flight(record)
+    times = moments(flight, options.rate_hz)
+    with RichProgress(console) as progress:
+        bar = progress.bar("film", len(times), unit="pictures")
+
+        def told() -> Iterator[int]:
+            for time_us in times:
+                yield time_us
+                bar.advance()
+
+        count = write_film(out, film(flight, camera, drawn, told()), options.rate_hz)
+    return f"film of flight {record.index}, {count} pictures"

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
+from fractions import Fraction
+from itertools import chain
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +30,19 @@ Shown = Literal["rgb", "grey", "depth", "segmentation"]
 Pixels = NDArray[np.uint8]
 """(h, w) or (h, w, 3)."""
 
-FILMS = (".gif", ".webp")
+Drawn = Callable[
+    [Arena, NDArray[np.float64], Intrinsics, NDArray[np.float64], NDArray[np.float64]], Pixels
+]
+"""A renderer: arena, obstacle centres, camera, its position and attitude -> picture."""
+
+VIDEO = ".mp4"
+"""H.264 in MP4."""
+
+FILMS = (".gif", VIDEO, ".webp")
 """Kinds of films."""
+
+VIDEO_CRF = 18
+"""Constant rate factor of x264, at which eyes see no loss (x264's documentation)."""
 
 STEP_MS = 10
 """A GIF counts time in these steps [ms]."""
@@ -67,40 +80,41 @@ def still(
     return coloured_segmentation(picture.seen)
 
 
+def moments(flight: ReplayedFlight, rate_hz: float) -> range:
+    """Return when a film of a flight has pictures [µs]: from the start of navigation to the end.
+
+    Args:
+        flight: The flight.
+        rate_hz: Pictures a second, as `period_ms` rounds them.
+    """
+    path, record = flight.path, flight.record
+    begin = record.started_us if record.navigation_us is None else record.navigation_us
+    begin, end = max(begin, int(path.time_us[0])), int(path.time_us[-1])
+    return range(begin, end + 1, period_ms(rate_hz) * US_PER_MS)
+
+
 def film(
-    flight: ReplayedFlight,
-    camera: Intrinsics,
-    show: Shown,
-    *,
-    rate_hz: float,
-    rays: int,
-    range_m: float,
+    flight: ReplayedFlight, camera: Intrinsics, drawn: Drawn, moments: Iterable[int]
 ) -> Iterator[Pixels]:
-    """Yield what the camera of a recorded flight saw, from the start of navigation to the end.
+    """Yield what the camera of a recorded flight saw.
 
     Args:
         flight: The flight.
         camera: Intrinsics; it sits and looks as that of the vehicle.
-        show: What to draw.
-        rate_hz: Pictures a second, as `period_ms` rounds them.
-        rays: Of a pixel of rgb and grey, each way.
-        range_m: Depth that is darkest [m].
+        drawn: What draws.
+        moments: When [µs].
 
     Raises:
         UsageError: The arena of the flight cannot be made any more.
     """
     if flight.arena is None:
         raise UsageError(f"flight {flight.label}: its arena cannot be made any more")
-    path, record = flight.path, flight.record
-    begin = record.started_us if record.navigation_us is None else record.navigation_us
-    begin, end = max(begin, int(path.time_us[0])), int(path.time_us[-1])
     mount = PolicyCamera.of(flight.vehicle.camera).mount
-    for time_us in range(begin, end + 1, period_ms(rate_hz) * US_PER_MS):
-        position, _, quaternion = pose_at(path, time_us)
+    for time_us in moments:
+        position, _, quaternion = pose_at(flight.path, time_us)
         at, attitude = camera_pose(position, quaternion, mount)
-        centers = flight.arena.centers_at(time_us - record.started_us)
-        pose = (camera, np.array(at), np.array(attitude))
-        yield still(flight.arena, centers, *pose, show, rays=rays, range_m=range_m)
+        centers = flight.arena.centers_at(time_us - flight.record.started_us)
+        yield drawn(flight.arena, centers, camera, np.array(at), np.array(attitude))
 
 
 def period_ms(rate_hz: float) -> int:
@@ -116,19 +130,47 @@ def write_png(path: Path, pixels: Pixels) -> None:
 
 
 def write_film(path: Path, pictures: Iterator[Pixels], rate_hz: float) -> int:
-    """Write pictures as an animated GIF or WebP, by the suffix; return their number.
+    """Write pictures as an animated GIF or WebP, or as a video, by the suffix.
 
-    Raises OSError.
+    Returns:
+        Their number.
+
+    Raises:
+        UsageError: A video whose width or height is odd.
+        OSError: It cannot be written.
+        ImportError: A video, and PyAV is not installed: the extra `film`.
     """
+    if path.suffix.lower() == VIDEO:
+        written, count = _video(pictures, period_ms(rate_hz))
+    else:
+        written, count = _animation(path.suffix[1:].upper(), pictures, period_ms(rate_hz))
+    replace_file(path, written)
+    return count
+
+
+def _animation(kind: str, pictures: Iterator[Pixels], each_ms: int) -> tuple[bytes, int]:
     images = [Image.fromarray(pixels) for pixels in pictures]
     written = io.BytesIO()
-    images[0].save(
-        written,
-        path.suffix[1:].upper(),
-        save_all=True,
-        append_images=images[1:],
-        duration=period_ms(rate_hz),
-        loop=0,
-    )
-    replace_file(path, written.getvalue())
-    return len(images)
+    images[0].save(written, kind, save_all=True, append_images=images[1:], duration=each_ms, loop=0)
+    return written.getvalue(), len(images)
+
+
+def _video(pictures: Iterator[Pixels], each_ms: int) -> tuple[bytes, int]:
+    """Encode pictures as they come: a long video needs no more memory than a short one."""
+    import av
+
+    first = next(pictures)
+    height, width = first.shape[:2]
+    if height % 2 or width % 2:
+        raise UsageError(f"{width} x {height} px: accepted: even numbers in an {VIDEO}")
+    written, count = io.BytesIO(), 0
+    with av.open(written, "w", format="mp4") as container:
+        stream: Any = container.add_stream("libx264", Fraction(1000, each_ms))
+        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+        stream.options = {"crf": f"{VIDEO_CRF}"}
+        for pixels in chain([first], pictures):
+            count += 1
+            kind = "rgb24" if pixels.ndim == 3 else "gray"
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(pixels, format=kind)))
+        container.mux(stream.encode())
+    return written.getvalue(), count

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from airl_mav.camera.picture import render_picture
 from airl_mav.camera.render import camera_pose
 from airl_mav.cli.options import carry_out
 from airl_mav.core.errors import UsageError
-from airl_mav.report.camera_pictures import film
+from airl_mav.report.camera_pictures import Drawn, Shown, film, moments, still, write_film
 from airl_mav.report.forensics.camera_view import PolicyCamera
 from airl_mav.report.replay.runs import ReplayedRun
 from tests.support.run_demo import write_demo_run
@@ -33,6 +34,10 @@ def render(*words: str) -> None:
     assert code == 0
 
 
+def drawn(show: Shown) -> Drawn:
+    return partial(still, show=show, rays=1, range_m=20.0)
+
+
 def load(frame: Image.Image) -> bool:
     """Load a picture: only then its duration is known."""
     frame.load()
@@ -44,7 +49,7 @@ def test_pictures_are_what_the_vehicles_camera_saw(folder: Path) -> None:
     run = ReplayedRun(folder)
     flight = run.flight(run.record(1))
     camera = Intrinsics.from_fov(64, 48, 1.5)
-    pictures = list(film(flight, camera, "rgb", rate_hz=50.0, rays=1, range_m=20.0))
+    pictures = list(film(flight, camera, drawn("rgb"), moments(flight, 50.0)))
     path, record = flight.path, flight.record
     assert record.navigation_us is not None
     seconds = (int(path.time_us[-1]) - record.navigation_us) / 1e6
@@ -80,13 +85,54 @@ def test_a_film_has_every_picture_for_its_time(folder: Path, tmp_path: Path, suf
     assert len(times) > 2
 
 
+@pytest.mark.parametrize("show", ["rgb", "grey"])
+def test_a_video_has_every_picture(folder: Path, tmp_path: Path, show: Shown) -> None:
+    """Decoded again: as many, in time, and as like the originals as a lossy codec leaves them."""
+    av = pytest.importorskip("av")
+    run = ReplayedRun(folder)
+    flight = run.flight(run.record(1))
+    camera = Intrinsics.from_fov(96, 64, 1.5)
+    pictures = list(film(flight, camera, drawn(show), moments(flight, 5.0)))
+    out = tmp_path / "flight.mp4"
+    assert write_film(out, iter(pictures), 5.0) == len(pictures)
+    with av.open(str(out)) as container:
+        frames = list(container.decode(video=0))
+    assert [frame.time for frame in frames] == pytest.approx(0.2 * np.arange(len(pictures)))
+    kind = "rgb24" if show == "rgb" else "gray"
+    for frame, picture in zip(frames, pictures, strict=True):
+        off = frame.to_ndarray(format=kind).astype(float) - picture
+        assert np.abs(off).mean() < 4.0
+
+
+def test_a_flight_is_path_traced(folder: Path, tmp_path: Path) -> None:
+    pytest.importorskip("mitsuba")
+    words = ("--rate-hz", "1", "--width-px", "48", "--height-px", "32", "--samples", "16")
+    films = {}
+    for renderer in ("raycast", "mitsuba"):
+        out = tmp_path / f"{renderer}.webp"
+        render(str(folder), "1", *words, "--renderer", renderer, "--out", str(out))
+        with Image.open(out) as image:
+            films[renderer] = [np.array(f.convert("RGB")) for f in ImageSequence.Iterator(image)]
+    assert len(films["mitsuba"]) == len(films["raycast"]) > 2
+    apart = [abs(a.astype(float) - b).mean() for a, b in zip(*films.values(), strict=True)]
+    assert 0.0 < max(apart) < 0.1 * 255.0, "the same views, in other light"
+
+
+def test_a_video_of_odd_size_is_refused(folder: Path, tmp_path: Path) -> None:
+    pytest.importorskip("av")
+    out = tmp_path / "x.mp4"
+    with pytest.raises(UsageError, match=r"49 x 32 px: accepted: even numbers in an \.mp4"):
+        render(str(folder), "--width-px", "49", "--height-px", "32", "--out", str(out))
+    assert not out.exists()
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
         (("--seed", "3"), "--seed 3: not for the picture of a flight"),
-        (("--renderer", "mitsuba"), "--renderer mitsuba: not for the picture of a flight"),
+        (("--north-m", "3"), "--north-m 3: not for the picture of a flight"),
         (("7",), "0 to 1, as far as recorded"),
-        (("--out", "x.png"), "accepted: a file name that ends in .gif or .webp"),
+        (("--out", "x.png"), "accepted: a file name that ends in .gif, .mp4 or .webp"),
     ],
 )
 def test_what_does_not_go_with_a_flight_is_one_line(
