@@ -72,21 +72,21 @@ def run(options: ViewOptions, console: Console | None = None) -> int:
     replayed, *others = (ReplayedRun(folder) for folder in folders)
     first = None if options.flight is None else replayed.record(options.flight)
     # Imported here: what draws is an extra.
-    import viser
-
-    from airl_mav.report.replay.page import ReplayPage
+    from airl_mav.view.local_server import LocalServer
 
     # What it prints says the same in more lines.
     with redirect_stdout(io.StringIO()):
-        server = viser.ViserServer(LOOPBACK, options.port or 0, verbose=False)
+        server = LocalServer(options.port or 0)
     try:
         port = server.get_port()
         if options.port not in (None, port):
             raise FieldError("port", options.port, problem="it is taken; accepted: a free one")
-        page = ReplayPage(server, replayed, others[0] if others else None, first)
         console.print(f"view  http://{LOOPBACK}:{port}", soft_wrap=True, highlight=False)
         console.file.flush()
-        page.run()
+        # A browser loads the page while the flight is prepared.
+        from airl_mav.report.replay.page import ReplayPage
+
+        ReplayPage(server, replayed, others[0] if others else None, first).run()
     except KeyboardInterrupt:
         return 0
     finally:

@@ -16,6 +16,7 @@ from airl_mav.flight.judge import Outcome
 from airl_mav.report.replay.flight import ReplayedFlight, parting_s
 from airl_mav.report.replay.runs import ReplayedRun
 from airl_mav.view.shown import Shown
+from tests.support.processes import PATIENCE_S, running
 from tests.support.run_demo import write_demo_run
 
 
@@ -116,6 +117,29 @@ def test_a_flight_outside_of_all_arenas_has_its_goal(flight: ReplayedFlight) -> 
         assert (north, east) == pytest.approx(flight.record.goal)
     finally:
         server.stop()
+
+
+@pytest.mark.slow
+def test_the_command_serves_pages_of_this_computer_alone(folder: Path, tmp_path: Path) -> None:
+    viser = pytest.importorskip("viser")
+    client = pytest.importorskip("websockets.sync.client")
+    from websockets.exceptions import InvalidStatus
+
+    with running(["-m", "airl_mav.cli.main", "view", str(folder), "1"], tmp_path) as program:
+        url = program.wait_for_text(r"view  http://(127\.0\.0\.1:\d+)")[1]
+        protocols = [f"viser-v{viser.__version__}"]
+        with (
+            pytest.raises(InvalidStatus, match="HTTP 403"),
+            client.connect(f"ws://{url}", origin="https://example.org", subprotocols=protocols),
+        ):
+            pass
+        own = client.connect(
+            f"ws://{url}", origin=f"http://{url}", subprotocols=protocols, max_size=None
+        )
+        with own as page:
+            assert page.recv(timeout=PATIENCE_S)
+        program.interrupt()
+        assert program.wait() == 0, program.text()
 
 
 class Watched:
