@@ -26,6 +26,7 @@ from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.ports import LOOPBACK
 from airl_mav.profiles.vehicle import load_vehicle
+from firmware_sim.autopilot.autopilot_state import Message
 from firmware_sim.autopilot.commander import Flight
 from firmware_sim.external.process import FirmwareProcess, StartCommand
 from firmware_sim.external.px4.program import (
@@ -56,10 +57,10 @@ class Flown:
     """A bridge as a flight controller."""
 
     internals = None
-    on_message = None
     flight = Flight()
 
     def __init__(self, bridge: Px4Bridge) -> None:
+        self.on_message: Callable[[Message], None] | None = None
         self.rate_hz, self.step = bridge.rate_hz, bridge.step
         self.use_truth, self.close = bridge.use_truth, bridge.close
 
@@ -182,10 +183,10 @@ def flight(
                     raise SystemExit(f"not in the air after {LIMIT_S:g} s; {child.log_tail()}")
             pacing.restart(simulation.time_us)
             before = dict(watch.seconds)
-            start_us, start = simulation.time_us, time.perf_counter()
+            start_us, begun_s = simulation.time_us, time.perf_counter()
             while simulation.time_us - start_us < HOVER_S[mode] * US_PER_S:
                 tick()
-            wall_s = time.perf_counter() - start
+            wall_s = time.perf_counter() - begun_s
             simulated_s = (simulation.time_us - start_us) / US_PER_S
             spent = {part: total - before[part] for part, total in watch.seconds.items()}
             simulation.close()
