@@ -77,7 +77,7 @@ class Operator:
         )
         self._decoder, self._encoder = Decoder(datagrams=True), Encoder(245, 190)
         self._system, self._ready, self._asked_us = 0, False, 0
-        self.airborne = False
+        self._on_ground, self.airborne = True, False
 
     def look(self, now_us: int, *, armed: bool) -> None:
         """Take what has come, and ask once a second for what is next."""
@@ -89,7 +89,8 @@ class Operator:
             return
         self._asked_us = now_us
         self._link.send(self._encoder.pack(dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3)))
-        if self._ready and not self.airborne:
+        # A take-off that is asked for again in the air climbs on from there, and never ends.
+        if self._ready and self._on_ground:
             number, first = (TAKEOFF, float("nan")) if armed else (ARM, 1.0)
             rest = [float("nan")] * 6
             command = dialect.MAVLink_command_long_message(self._system, 1, number, 0, first, *rest)
@@ -100,6 +101,7 @@ class Operator:
             self._system = message.get_srcSystem()
             self._ready = message.system_status in (3, 4)
         elif message.get_type() == "EXTENDED_SYS_STATE":
+            self._on_ground = message.landed_state == dialect.MAV_LANDED_STATE_ON_GROUND
             self.airborne = message.landed_state == dialect.MAV_LANDED_STATE_IN_AIR
 
     def close(self) -> None:
