@@ -11,6 +11,7 @@ import time
 
 import numpy as np
 from bench_depth import FOV, POSES, RANGE_M, make_arena, make_poses, render_all
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
@@ -27,8 +28,28 @@ ROUNDS = 15
 
 
 @kernel
-def colour_all(rgb, depth, seen, work, position, attitude, focal, cx, cy, bounds, shape, center,
-               half, yaw, texture, per_m, offset, albedo, lights, patterns):  # type: ignore[no-untyped-def] # fmt: skip
+def colour_all(
+    rgb: NDArray[np.uint8],
+    depth: NDArray[np.float32],
+    seen: NDArray[np.int32],
+    work: Work,
+    position: NDArray[np.float64],
+    attitude: NDArray[np.float64],
+    focal: float,
+    cx: float,
+    cy: float,
+    bounds: NDArray[np.float64],
+    shape: NDArray[np.int8],
+    center: NDArray[np.float64],
+    half: NDArray[np.float64],
+    yaw: NDArray[np.float64],
+    texture: NDArray[np.int8],
+    per_m: NDArray[np.float32],
+    offset: NDArray[np.float32],
+    albedo: NDArray[np.float32],
+    lights: NDArray[np.float32],
+    patterns: NDArray[np.float32],
+) -> None:
     for i in range(len(position)):
         p, q = position[i], attitude[i]
         render_colour(
@@ -41,17 +62,19 @@ def colour_all(rgb, depth, seen, work, position, attitude, focal, cx, cy, bounds
 def rates(arena: Arena, k: Intrinsics, poses: tuple[np.ndarray, np.ndarray]) -> tuple[float, float]:
     """Return depth and colour images a second: of each the best of rounds taken in turns."""
     o, look, shape = arena.obstacles, ColourArrays.of(arena.look), (k.height, k.width)
-    bodies = (arena.bounds.as_array(), o.shape, o.center, o.half_size, o.yaw)
     depth, seen = np.empty(shape, np.float32), np.empty(shape, np.int32)
     rgb, patterns = np.empty((*shape, 3), np.uint8), atlas()
     work = Work.of(k.width, k.height, False)
+    lens, bounds = (k.focal, k.cx, k.cy), arena.bounds.as_array()
+    bodies = (*poses, *lens, bounds, o.shape, o.center, o.half_size, o.yaw)
     surfaces = (look.texture, look.per_m, look.offset, look.albedo, look.lights, patterns)
+    coloured = (*bodies, *surfaces)
     times: tuple[list[float], list[float]] = ([], [])
     for _ in range(ROUNDS):
         start = time.perf_counter()
-        render_all(depth, *poses, k.focal, k.cx, k.cy, *bodies)
+        render_all(depth, *bodies)
         middle = time.perf_counter()
-        colour_all(rgb, depth, seen, work, *poses, k.focal, k.cx, k.cy, *bodies, *surfaces)
+        colour_all(rgb, depth, seen, work, *coloured)
         times[0].append(middle - start)
         times[1].append(time.perf_counter() - middle)
     return POSES / min(times[0]), POSES / min(times[1])

@@ -14,6 +14,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pybullet
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
@@ -58,7 +59,19 @@ def make_poses(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
 
 
 @kernel
-def render_all(out, position, attitude, focal, cx, cy, bounds, shape, center, half, yaw):  # type: ignore[no-untyped-def]
+def render_all(
+    out: NDArray[np.float32],
+    position: NDArray[np.float64],
+    attitude: NDArray[np.float64],
+    focal: float,
+    cx: float,
+    cy: float,
+    bounds: NDArray[np.float64],
+    shape: NDArray[np.int8],
+    center: NDArray[np.float64],
+    half: NDArray[np.float64],
+    yaw: NDArray[np.float64],
+) -> None:
     for i in range(len(position)):
         p, q = position[i], attitude[i]
         render_depth(

@@ -49,7 +49,9 @@ def result(name: str, step_s: float, hz: float, steps: float, seconds: float) ->
     return {"name": name, "step_s": step_s, "hz": hz, "steps": rate, "ticks": rate * step_s * hz}
 
 
-def fastest(stretch: Callable[[], tuple[float, float]], repeats: int = STRETCHES) -> tuple:
+def fastest(
+    stretch: Callable[[], tuple[float, float]], repeats: int = STRETCHES
+) -> tuple[float, float]:
     """Return steps and seconds of the fastest stretch; the first one warms up."""
     stretch()
     return min((stretch() for _ in range(repeats)), key=lambda s: s[1] / s[0])

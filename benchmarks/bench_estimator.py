@@ -116,8 +116,9 @@ def pilot(
         if tick == 0:
             autopilot.set_mode(Mode.OFFBOARD)
         yield
-    if autopilot.flight.mode is not Mode.OFFBOARD:
-        raise SystemExit(f"the flight ended in {autopilot.flight.mode.name}")
+    flight = autopilot.flight
+    if flight.mode is not Mode.OFFBOARD:
+        raise SystemExit(f"the flight ended in {flight.mode.name}")
     autopilot.set_mode(Mode.LAND)
     end_us = simulation.time_us + LONGEST_LANDING_S * US_PER_S
     while autopilot.flight.phase >= Phase.GROUND and simulation.time_us < end_us:
@@ -149,7 +150,7 @@ def shown(title: str, noted: Noted) -> Table:
         table.add_column(column, justify="left" if column == "of" else "right")
     for (name, freedom), values in noted.values.items():
         squares = np.array(values)
-        low, high = chi2.ppf([0.025, 0.975], freedom)
+        low, high = chi2.ppf(0.025, freedom), chi2.ppf(0.975, freedom)
         below = float((squares < chi2.ppf(0.95, freedom)).mean())
         within = float(((squares > low) & (squares < high)).mean())
         mean = float(squares.mean()) / freedom

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from rich.console import Console
 from rich.table import Table
+from stable_baselines3.common.policies import BasePolicy
 from torch import nn
 
 from airl_mav.envs.sb3 import NavigationVecEnv
@@ -31,7 +32,7 @@ SECONDS = 1.5  # of each measurement
 
 def fastest(model: DoubleDQN) -> float:
     """Samples a second of CPU time, of the fastest tenth of the updates: what an idle core does."""
-    took = []
+    took: list[float] = []
     end = time.perf_counter() + SECONDS
     while time.perf_counter() < end or len(took) < 20:
         start = time.process_time()
@@ -40,10 +41,11 @@ def fastest(model: DoubleDQN) -> float:
     return float(BATCH / np.quantile(took, 0.1))
 
 
-def as_plain(policy: nn.Module) -> None:
+def as_plain(policy: BasePolicy) -> None:
     for module in policy.modules():
         if isinstance(module, nn.Conv2d):
-            module.to(memory_format=torch.contiguous_format)
+            # torch declares no overload of `to` with a layout alone.
+            module.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
     policy.optimizer.state.clear()
 
 

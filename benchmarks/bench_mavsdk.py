@@ -142,8 +142,9 @@ class TappedEndpoint(UdpEndpoint):
             self._tap.arrived(data)
             yield peer, data
 
-    def towards(self, peer: Peer) -> TappedPeer:
-        return TappedPeer(self._socket, self._remote if peer is None else peer, self._tap)
+    def towards(self, peer: Peer) -> TappedPeer | None:
+        address = self._remote if peer is None else peer
+        return None if address is None else TappedPeer(self._socket, address, self._tap)
 
 
 def run_at_once(*, with_children: bool) -> None:

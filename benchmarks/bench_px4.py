@@ -26,6 +26,7 @@ from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.ports import LOOPBACK
 from airl_mav.profiles.vehicle import load_vehicle
+from firmware_sim.autopilot.autopilot_state import Message
 from firmware_sim.autopilot.commander import Flight
 from firmware_sim.external.process import FirmwareProcess, StartCommand
 from firmware_sim.external.px4.program import (
@@ -56,10 +57,10 @@ class Flown:
     """A bridge as a flight controller."""
 
     internals = None
-    on_message = None
     flight = Flight()
 
     def __init__(self, bridge: Px4Bridge) -> None:
+        self.on_message: Callable[[Message], None] | None = None
         self.rate_hz, self.step = bridge.rate_hz, bridge.step
         self.use_truth, self.close = bridge.use_truth, bridge.close
 
@@ -76,7 +77,7 @@ class Operator:
         )
         self._decoder, self._encoder = Decoder(datagrams=True), Encoder(245, 190)
         self._system, self._ready, self._asked_us = 0, False, 0
-        self.airborne = False
+        self._on_ground, self.airborne = True, False
 
     def look(self, now_us: int, *, armed: bool) -> None:
         """Take what has come, and ask once a second for what is next."""
@@ -88,7 +89,8 @@ class Operator:
             return
         self._asked_us = now_us
         self._link.send(self._encoder.pack(dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 0, 3)))
-        if self._ready and not self.airborne:
+        # A take-off that is asked for again in the air climbs on from there, and never ends.
+        if self._ready and self._on_ground:
             number, first = (TAKEOFF, float("nan")) if armed else (ARM, 1.0)
             rest = [float("nan")] * 6
             command = dialect.MAVLink_command_long_message(self._system, 1, number, 0, first, *rest)
@@ -99,6 +101,7 @@ class Operator:
             self._system = message.get_srcSystem()
             self._ready = message.system_status in (3, 4)
         elif message.get_type() == "EXTENDED_SYS_STATE":
+            self._on_ground = message.landed_state == dialect.MAV_LANDED_STATE_ON_GROUND
             self.airborne = message.landed_state == dialect.MAV_LANDED_STATE_IN_AIR
 
     def close(self) -> None:
@@ -182,10 +185,10 @@ def flight(
                     raise SystemExit(f"not in the air after {LIMIT_S:g} s; {child.log_tail()}")
             pacing.restart(simulation.time_us)
             before = dict(watch.seconds)
-            start_us, start = simulation.time_us, time.perf_counter()
+            start_us, begun_s = simulation.time_us, time.perf_counter()
             while simulation.time_us - start_us < HOVER_S[mode] * US_PER_S:
                 tick()
-            wall_s = time.perf_counter() - start
+            wall_s = time.perf_counter() - begun_s
             simulated_s = (simulation.time_us - start_us) / US_PER_S
             spent = {part: total - before[part] for part, total in watch.seconds.items()}
             simulation.close()

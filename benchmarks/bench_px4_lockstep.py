@@ -16,7 +16,7 @@ import os
 import statistics
 import tempfile
 import time
-from collections import Counter
+from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -91,20 +91,26 @@ class Meter(Observer):
             self.looks.append(Look(state.time_us, time.perf_counter(), threads()))
 
 
+Spending = dict[tuple[str, str], float]
+"""By name of the process and name of the thread."""
+
+
 class Flight(NamedTuple):
     """What one flight took for each simulated second."""
 
     speed: float
     """Multiple of real time."""
-    ran_s: Counter[tuple[str, str]]
-    waited_s: Counter[tuple[str, str]]
-    slices: Counter[tuple[str, str]]
+    ran_s: Spending
+    waited_s: Spending
+    slices: Spending
 
 
 def measured(first: Look, last: Look) -> Flight:
     """Return what was spent between two looks."""
     simulated_s = (last.time_us - first.time_us) / US_PER_S
-    ran, waited, slices = Counter[tuple[str, str]](), Counter[tuple[str, str]](), Counter()
+    ran: Spending = defaultdict(float)
+    waited: Spending = defaultdict(float)
+    slices: Spending = defaultdict(float)
     for key, after in last.threads.items():
         before, name = first.threads.get(key, Spent(0, 0, 0)), key[:2]
         ran[name] += (after.ran_ns - before.ran_ns) / NS_PER_S / simulated_s
@@ -147,7 +153,7 @@ def show(flights: list[Flight], threads_shown: int) -> None:
     table = Table("for a simulated second", "processor [ms]", "waited [ms]", "times on a core")
     names = sorted(
         {name for flight in flights for name in flight.ran_s},
-        key=lambda name: -statistics.median(flight.ran_s[name] for flight in flights),
+        key=lambda name: -statistics.median(flight.ran_s.get(name, 0.0) for flight in flights),
     )
     for program in dict.fromkeys(program for program, _ in names):
         of_it = [name for name in names if name[0] == program]
@@ -159,8 +165,12 @@ def show(flights: list[Flight], threads_shown: int) -> None:
 
 def _cells(flights: list[Flight], names: list[tuple[str, str]]) -> list[str]:
     ran, waited, slices = (
-        statistics.median(sum(getattr(flight, kind)[name] for name in names) for flight in flights)
-        for kind in ("ran_s", "waited_s", "slices")
+        statistics.median(sum(spent.get(name, 0.0) for name in names) for spent in by_flight)
+        for by_flight in (
+            [flight.ran_s for flight in flights],
+            [flight.waited_s for flight in flights],
+            [flight.slices for flight in flights],
+        )
     )
     return [f"{ran * 1e3:.1f}", f"{waited * 1e3:.1f}", f"{slices:.0f}"]
 

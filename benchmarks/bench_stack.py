@@ -40,7 +40,7 @@ from firmware_sim.mavlink.link import LinkConfig, gcs_link
 from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.plant.plant import Plant
 from firmware_sim.plant.sensors import SensorSuite
-from firmware_sim.simulation import EpisodeSetup, Simulation
+from firmware_sim.simulation import EpisodeSetup, Simulation, builtin_autopilot
 
 FLIGHT_S = 30.0
 REPEATS = 3
@@ -146,29 +146,29 @@ def hover(
 ) -> Timed:
     """Fly slowly by setpoints; the links' frames are packed and thrown away."""
     setup = EpisodeSetup(vehicle, None, 1)
-    simulation = Simulation(setup, start_us=0, clock=SimClock())
-    pilot = simulation.autopilot
+    autopilot = builtin_autopilot(setup)
+    simulation = Simulation(setup, start_us=0, clock=SimClock(), autopilot=autopilot)
     for _ in range(round(2.0 / TICK_S)):
         simulation.tick()
-    pilot.arm(force=False)
-    pilot.takeoff(2.5)
+    autopilot.arm(force=False)
+    autopilot.takeoff(2.5)
     for _ in range(round(8.0 / TICK_S)):
         simulation.tick()
     free = np.full(3, math.nan)
     setpoint = Setpoint(free, np.array([1.0, 0.0, 0.0]), math.nan, 0.2)
-    pilot.offer_setpoint(setpoint, simulation.time_us)
-    pilot.set_mode(Mode.OFFBOARD)
+    autopilot.offer_setpoint(setpoint, simulation.time_us)
+    autopilot.set_mode(Mode.OFFBOARD)
     endpoints = [MemoryEndpoint() for _ in links]
     server = None
     if links:
         opened = [link(endpoint) for link, endpoint in zip(links, endpoints, strict=True)]
-        server = MavlinkServer(opened, pilot, boot_unix_us=0)
+        server = MavlinkServer(opened, autopilot, boot_unix_us=0)
     every = round(0.05 / TICK_S)
     begins()
     timer = Timer()
     for i in range(round(FLIGHT_S / TICK_S)):
         if i % every == 0:
-            pilot.offer_setpoint(setpoint, simulation.time_us)
+            autopilot.offer_setpoint(setpoint, simulation.time_us)
         if server is not None:
             server.receive(simulation.time_us)
         simulation.tick()

@@ -21,26 +21,33 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from unittest.mock import patch
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from airl_mav.camera.frame import Frame
 from airl_mav.core.clock import WallClock
 from airl_mav.core.progress import Bar
 from airl_mav.latency.stamps import DecisionLog
-from airl_mav.policy.actions import Action
+from airl_mav.policy.actions import Action, limited
 from airl_mav.policy.observation import Kinematics, Observation
 from airl_mav.profiling import hil
 from airl_mav.profiling.bare import BareLoop
 from airl_mav.profiling.policy_under_test import PolicyUnderTest, open_policy
 from airl_mav.profiling.request import ProfileRequest
 from companion import pilot
+from companion.camera import ReceivedFrame
 
 CALLS, REPEATS = 10_000, 50
 FLIGHTS, DECISIONS, WARM_UP = 3, 200, 20
 STAMP_LIMIT_US, CHANGE_LIMIT = 0.5, 0.01
+
+READY = "Ctrl-C ends it."
+"""The last that airl-firmware says before it flies."""
+
+START_S = 300.0
+"""Longest wait for it: the first start after an install compiles."""
 
 NETWORKS = {
     "milliseconds": ProfileRequest(
@@ -61,29 +68,35 @@ def best_us(call: Callable[[], object]) -> tuple[float, float]:
     return min(times), float(np.median(times))
 
 
-class Watch:
-    """Times a decision from inside the pilot: from the encoding to the bounded action."""
+@contextmanager
+def watched() -> Iterator[list[int]]:
+    """Time decisions from inside the pilot, from the encoding to the bounded action [ns]."""
+    took_ns: list[int] = []
+    started_ns = 0
+    encode = pilot.Pilot._observe
 
-    def __init__(self) -> None:
-        self.took_ns: list[int] = []
-        self._started_ns = 0
-        self._encode, self._limited = pilot.encode, pilot.limited
+    def encode_timed(
+        of: pilot.Pilot,
+        seen: ReceivedFrame,
+        state: Kinematics,
+        goal: tuple[float, float],
+        now_us: int,
+    ) -> Observation:
+        nonlocal started_ns
+        started_ns = time.perf_counter_ns()
+        return encode(of, seen, state, goal, now_us)
 
-    def __enter__(self) -> Watch:
-        def encode(frame: Frame, state: Kinematics, goal: tuple[float, float]) -> Observation:
-            self._started_ns = time.perf_counter_ns()
-            return self._encode(frame, state, goal)
+    def limited_timed(action: Action, speed_m_s: float) -> Action:
+        bounded = limited(action, speed_m_s)
+        took_ns.append(time.perf_counter_ns() - started_ns)
+        return bounded
 
-        def limited(action: Action, speed_m_s: float) -> Action:
-            bounded = self._limited(action, speed_m_s)
-            self.took_ns.append(time.perf_counter_ns() - self._started_ns)
-            return bounded
-
-        pilot.encode, pilot.limited = encode, limited
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pilot.encode, pilot.limited = self._encode, self._limited
+    # Raises AttributeError where the pilot has no such name any more.
+    with (
+        patch.object(pilot.Pilot, "_observe", encode_timed),
+        patch.object(pilot, "limited", limited_timed),
+    ):
+        yield took_ns
 
 
 @dataclass(frozen=True)
@@ -108,9 +121,15 @@ def firmware(vehicle: str, folder: Path) -> Iterator[tuple[str, str]]:
     words = [sys.executable, "-m", "airl_mav.cli.firmware", "--vehicle", vehicle]
     words += ["--arena", "no-obstacles", "--api-port", f"{udp[0]}", "--gcs-port", f"{udp[1]}"]
     words += ["--api-local-port", "0", "--gcs-local-port", "0", "--camera-port", f"{tcp}"]
-    with (folder / "firmware.log").open("wb") as log:
+    said = folder / "firmware.log"
+    with said.open("wb") as log:
         process = subprocess.Popen(words, stdout=log, stderr=log)  # noqa: S603
         try:
+            limit_s = time.monotonic() + START_S
+            while READY not in said.read_text():
+                if process.poll() is not None or time.monotonic() > limit_s:
+                    raise SystemExit(f"airl-firmware did not start: {said.read_text()}")
+                time.sleep(0.1)
             yield f"udpin://127.0.0.1:{udp[0]}", f"tcp://127.0.0.1:{tcp}"
         finally:
             process.terminate()
@@ -119,10 +138,10 @@ def firmware(vehicle: str, folder: Path) -> Iterator[tuple[str, str]]:
 
 def flown(request: ProfileRequest, policy: PolicyUnderTest) -> Flight:
     """Fly, and pair each t2 with the work inside it."""
-    with Watch() as watch:
+    with watched() as took_ns:
         (stamps,) = hil.measure(request, policy, Bar()).flights
     t2_us = stamps["action_ready_us"] - stamps["infer_start_us"]
-    inside_us = np.array(watch.took_ns[WARM_UP : WARM_UP + len(t2_us)]) / 1e3
+    inside_us = np.array(took_ns[WARM_UP : WARM_UP + len(t2_us)]) / 1e3
     return Flight(t2_us - inside_us, inside_us)
 
 

@@ -120,12 +120,17 @@ def namespaces() -> Iterator[tuple[str, str]]:
             ip("-n", name, "addr", "add", f"{address}/24", "dev", link)
             ip("-n", name, "link", "set", link, "up")
             ip("-n", name, "link", "set", "lo", "up")
-        stack.callback(lambda: [kill(pids(name)) for name in names])
+        for name in names:
+            stack.callback(kill_in, name)
         yield names
 
 
 def pids(namespace: str) -> list[int]:
     return [int(pid) for pid in ip("netns", "pids", namespace).split()]
+
+
+def kill_in(namespace: str) -> None:
+    kill(pids(namespace))
 
 
 def kill(victims: list[int]) -> None:

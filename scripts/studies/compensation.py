@@ -73,7 +73,8 @@ class Scaled(ExpectedLatency):
         self._factor = factor
 
     def expected_us(self) -> NDArray[np.int64]:
-        return np.rint(self._factor * super().expected_us()).astype(np.int64)
+        scaled: NDArray[np.int64] = np.rint(self._factor * super().expected_us()).astype(np.int64)
+        return scaled
 
 
 class Quantile(ExpectedLatency):

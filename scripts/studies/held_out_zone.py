@@ -100,8 +100,10 @@ def run(options: StudyOptions, console: Console | None = None) -> int:
                 flights = with_interval(found.flight_time_s, 2), with_interval(found.distance_m, 1)
                 row = f"{zone} {config.radius_m:g} m", cell.cell.label
                 rows.append((*row, rate_with_interval(found.success_rate), *flights))
-    columns = Column("goals", number=False), Column("policy", number=False), Column("success", "%")
-    columns += Column("flight time", "s"), Column("distance", "m")
+    columns = (
+        *(Column("goals", number=False), Column("policy", number=False)),
+        *(Column("success", "%"), Column("flight time", "s"), Column("distance", "m")),
+    )
     table = ("held-out-zone", "Goals farther off than any that was learned", columns, tuple(rows))
     print_table(TableView(*table, (), in_terminal="stacked"), console, wrap=True)
     return 0
