@@ -118,7 +118,12 @@ class Simulation:
         """None on an endless floor."""
         if setup.arena is not None:
             camera = SimulatedCamera(
-                setup.vehicle.camera, setup.arena, start_us, asked.sensors, setup.seed
+                setup.vehicle.camera,
+                setup.arena,
+                start_us,
+                asked.sensors,
+                setup.seed,
+                asked.renderer,
             )
             self._camera = camera
             if self.faults is not None:

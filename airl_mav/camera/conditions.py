@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from importlib.util import find_spec
 
 from airl_mav.core.errors import FieldError
 from airl_mav.faults.model import Fault
+from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.profiles.camera_kind import Renderer
 from airl_mav.profiles.conditions import SensorNoise
 from airl_mav.profiles.vehicle import Camera
 
@@ -30,3 +33,26 @@ def check_noise(
         if (fault.part, fault.kind) == ("camera", "noise"):
             accepted = f"a depth camera; the vehicle's is of kind {camera.kind!r}"
             raise FieldError("faults", str(fault), accepted)
+
+
+def check_renderer(camera: Camera, renderer: Renderer, arena: ArenaSpec) -> None:
+    """Raise FieldError for what a renderer does not draw.
+
+    Args:
+        camera: The camera.
+        renderer: What draws.
+        arena: Where it looks.
+    """
+    if renderer == "raycast":
+        return
+    accepted = None
+    if camera.kind == "depth":
+        accepted = "raycast with a depth camera; mitsuba draws colour"
+    elif camera.projection != "pinhole":
+        accepted = f"raycast with a {camera.projection} camera"
+    elif max(arena.appearance.fog.extinction_1_m) > 0.0:
+        accepted = "raycast in an arena with fog"
+    elif find_spec("mitsuba") is None:
+        accepted = "raycast: mitsuba is not installed (pip install 'airl-mav[render]')"
+    if accepted is not None:
+        raise FieldError("renderer", renderer, accepted)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,58 @@ from airl_mav.camera.frame import depth_to_z16
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.picture import grey, render_picture
 from airl_mav.camera.render import render
+from airl_mav.profiles.camera_kind import Renderer
 from airl_mav.vehicle.rotation import Quat, Vec
+
+PATHS = 16
+"""Paths that Mitsuba traces through a pixel: their noise is that of a sensor in daylight."""
+
+
+class Exposure(Protocol):
+    """Takes images; see `expose`."""
+
+    def __call__(
+        self,
+        arena: Arena,
+        centers: NDArray[np.float64],
+        intrinsics: Intrinsics,
+        max_range: float,
+        position: Vec | NDArray[np.float64],
+        quaternion: Quat | NDArray[np.float64],
+    ) -> NDArray[Any]:
+        """Return the image."""
+        ...
+
+
+def exposure_by(renderer: Renderer) -> Exposure:
+    """Return what takes the images of a camera with this renderer."""
+    return expose if renderer == "raycast" else PathTraced()
+
+
+class PathTraced:
+    """Takes colour images by Mitsuba's path tracer, each with noise of its own."""
+
+    def __init__(self) -> None:
+        # Imported here: what it draws with is an extra.
+        from airl_mav.camera.mitsuba import PathTracer
+
+        self._tracer = PathTracer(PATHS)
+        self._taken = 0
+
+    def __call__(
+        self,
+        arena: Arena,
+        centers: NDArray[np.float64],
+        intrinsics: Intrinsics,
+        max_range: float,  # noqa: ARG002 (colour has no limit)
+        position: Vec | NDArray[np.float64],
+        quaternion: Quat | NDArray[np.float64],
+    ) -> NDArray[Any]:
+        """Return the image; see `expose`. Raises as `mitsuba.path_traced`."""
+        pose = np.asarray(position), np.asarray(quaternion)
+        rgb = self._tracer(arena, centers, intrinsics, *pose, seed=self._taken)
+        self._taken += 1
+        return rgb if intrinsics.kind == "rgb" else grey(rgb)[..., None]
 
 
 def expose(

@@ -55,23 +55,45 @@ def path_traced(
         UsageError: The arena has fog, or the camera is a cylinder.
         ImportError: Mitsuba is not installed: the extra `render`.
     """
-    if intrinsics.cylindrical:
-        raise UsageError("renderer mitsuba: accepted: a pinhole camera, not a cylindrical one")
-    if arena.look.light.extinction > 0.0:
-        raise UsageError("renderer mitsuba: accepted: an arena without appearance.fog")
-    import mitsuba as mi
+    return PathTracer(samples)(arena, centers, intrinsics, position, quaternion, seed)
 
-    mi.set_variant(VARIANT)
-    scene = {
-        "type": "scene",
-        "integrator": {"type": "path", "max_depth": MOST_BOUNCES},
-        "sensor": _sensor(mi, intrinsics, position, quaternion, samples),
-        **_lights(mi, arena.look.light),
-        **_bodies(mi, arena, centers),
-    }
-    rendered = np.array(mi.render(mi.load_dict(scene), seed=seed))
-    encoded: NDArray[np.uint8] = np.rint(255.0 * srgb_of(rendered[..., :3])).astype(np.uint8)
-    return encoded
+
+class PathTracer:
+    """Draws images, and keeps the scene of the last one for as long as nothing in it moves."""
+
+    def __init__(self, samples: int) -> None:
+        """Trace so many paths a pixel."""
+        self._samples = samples
+        self._arena: Arena | None = None
+        self._centers: Floats = np.zeros((0, 3))
+        self._scene: Any = None
+
+    def __call__(
+        self,
+        arena: Arena,
+        centers: Floats,
+        intrinsics: Intrinsics,
+        position: Floats,
+        quaternion: Floats,
+        seed: int,
+    ) -> NDArray[np.uint8]:
+        """Return the image; see `path_traced`."""
+        if intrinsics.cylindrical:
+            raise UsageError("renderer mitsuba: accepted: a pinhole camera, not a cylindrical one")
+        if arena.look.light.extinction > 0.0:
+            raise UsageError("renderer mitsuba: accepted: an arena without appearance.fog")
+        import mitsuba as mi
+
+        mi.set_variant(VARIANT)
+        if arena is not self._arena or not np.array_equal(centers, self._centers):
+            self._arena, self._centers = arena, np.array(centers)
+            integrator = {"type": "path", "max_depth": MOST_BOUNCES}
+            bodies = _lights(mi, arena.look.light) | _bodies(mi, arena, centers)
+            self._scene = mi.load_dict({"type": "scene", "integrator": integrator, **bodies})
+        sensor = mi.load_dict(_sensor(mi, intrinsics, position, quaternion, self._samples))
+        rendered = np.array(mi.render(self._scene, sensor=sensor, seed=seed))
+        encoded: NDArray[np.uint8] = np.rint(255.0 * srgb_of(rendered[..., :3])).astype(np.uint8)
+        return encoded
 
 
 def _sensor(

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 from pydantic import Field
@@ -24,6 +24,7 @@ from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.frames import quat_from_euler
 from airl_mav.core.progress import RichProgress
 from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.profiles.camera_kind import Renderer
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.projection import Projection, check_fov
 from airl_mav.rehearsal.run_folder import load
@@ -85,7 +86,7 @@ class RenderOptions(ProfileModel):
     show: Shown = Field(
         default="rgb", description="colour, its luma, depth (near is bright), or what is seen"
     )
-    renderer: Literal["raycast", "mitsuba"] = Field(
+    renderer: Renderer = Field(
         default="raycast", description="what draws; mitsuba draws rgb alone, without fog"
     )
     samples: int | None = quantity(

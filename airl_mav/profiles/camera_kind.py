@@ -8,6 +8,9 @@ CameraKind = Literal["depth", "rgb", "grey"]
 """`depth`: uint16 (h, w), Z16 in millimetres. `rgb`: uint8 (h, w, 3), sRGB. `grey`: uint8
 (h, w, 1), luma of the sRGB numbers."""
 
+Renderer = Literal["raycast", "mitsuba"]
+"""What draws images: the ray caster, or Mitsuba's path tracer, its reference for colour."""
+
 KINDS: Final[tuple[CameraKind, ...]] = get_args(CameraKind)
 
 CHANNELS: Final[dict[CameraKind, int]] = {"depth": 1, "rgb": 3, "grey": 1}

@@ -8,7 +8,7 @@ from contextlib import closing
 from dataclasses import dataclass, field
 
 from airl_mav.arena.generate import generate
-from airl_mav.camera.conditions import check_noise
+from airl_mav.camera.conditions import check_noise, check_renderer
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loaded import check_spread, equipped
 from airl_mav.profiles.loading import load_profile
@@ -114,9 +114,10 @@ def episode_of(
         computer_w: What its computer draws from the pack [W].
 
     Raises:
-        UsageError: No arena can be made of the seed.
+        UsageError: No arena can be made of the seed, or it cannot be drawn as asked.
     """
     spec = load_profile("arenas", asked.arena, ArenaSpec)
+    check_renderer(vehicle.camera, asked.renderer, spec)
     width_m = vehicle.body.width_m
     arena = generate(spec, asked.seed, name=asked.arena, vehicle_width_m=width_m)
     goal = (float(arena.goal[0]), float(arena.goal[1]))

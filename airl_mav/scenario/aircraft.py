@@ -10,6 +10,7 @@ from pydantic import Field
 
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.faults.model import Fault
+from airl_mav.profiles.camera_kind import Renderer
 from airl_mav.profiles.conditions import Payload, SensorNoise, Spread, WindSettings
 
 VehicleName = Annotated[
@@ -154,6 +155,11 @@ class Aircraft(ProfileModel):
         description="what moves the vehicle's body, and finds what it touches: pybullet, or the"
         " batch twin's compiled rigid body with contacts of its own, which needs no pybullet and"
         " is the default where that is not installed; level gym has neither",
+    )
+    renderer: Annotated[Renderer, NO_TWIN] = Field(
+        default="raycast",
+        description="what draws the images of a colour camera: the ray caster, or at level lockstep"
+        " Mitsuba's path tracer, a hundred times slower",
     )
     firmware: FirmwareName = Field(
         default="builtin",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from airl_mav.camera.conditions import check_noise
+from airl_mav.camera.conditions import check_noise, check_renderer
 from airl_mav.core.errors import FieldError
 from airl_mav.flight.judge import GOAL_RADIUS_M
 from airl_mav.latency.injection import Injection, without_timing
@@ -46,6 +46,7 @@ def resolve(scenario: Scenario) -> ResolvedScenario:
     injection = select_injection(
         scenario.latency, computer, scenario.workload, policy_sha256=policy.sha256, macs=policy.macs
     )
+    check_renderer(vehicle.camera, scenario.renderer, arena)
     check_quota(scenario, injection, scenario.level)
     resolved = ResolvedScenario(
         scenario=scenario,

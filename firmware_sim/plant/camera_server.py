@@ -11,7 +11,7 @@ import zmq
 from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena
-from airl_mav.camera.exposure import expose
+from airl_mav.camera.exposure import exposure_by
 from airl_mav.camera.frame import Frame
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.noise import noise_of, noisy_frame
@@ -19,6 +19,7 @@ from airl_mav.camera.render import Mount, camera_pose
 from airl_mav.core.constants import DEG
 from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import Vector
+from airl_mav.profiles.camera_kind import Renderer
 from airl_mav.profiles.conditions import SensorNoise
 from airl_mav.profiles.vehicle import Camera
 from firmware_sim.plant.sensors import Rate
@@ -34,6 +35,7 @@ class SimulatedCamera:
         start_us: int = 0,
         noise: SensorNoise | None = None,
         seed: int = 0,
+        renderer: Renderer = "raycast",
     ) -> None:
         """Make the camera of a vehicle profile.
 
@@ -43,7 +45,9 @@ class SimulatedCamera:
             start_us: When the first frame is due [µs].
             noise: Conditions that its images are taken in; None: the usual ones.
             seed: Of that noise.
+            renderer: What draws its images.
         """
+        self._expose = exposure_by(renderer)
         self._noise = noise_of(camera, noise or SensorNoise())
         self._seed = seed
         self._intrinsics = Intrinsics.of(camera)
@@ -96,7 +100,7 @@ class SimulatedCamera:
     def _look(self, elapsed_us: int, position: Vector, quaternion: Vector) -> NDArray[Any]:
         at, attitude = camera_pose(position, quaternion, self._mount)
         centers = self._arena.centers_at(elapsed_us)
-        return expose(self._arena, centers, self._intrinsics, self._max_range, at, attitude)
+        return self._expose(self._arena, centers, self._intrinsics, self._max_range, at, attitude)
 
 
 class CameraServer:
