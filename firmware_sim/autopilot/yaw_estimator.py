@@ -16,9 +16,7 @@ the variance of the velocity where it takes a standard deviation; here it is giv
 
 from __future__ import annotations
 
-import cmath
 import math
-from collections import deque
 
 import numpy as np
 
@@ -35,6 +33,7 @@ from airl_mav.vehicle.rotation import (
     rotate,
     yaw_of,
 )
+from firmware_sim.autopilot.turned_motion import TurnedMotion
 
 N_MODELS = 5
 TILT_GAIN = 0.2
@@ -81,12 +80,6 @@ MODEL_SIZE = 17
 # IMU alone (2) [m/s], along a heading that differs from the first model's by what GPS turned that.
 FORCE, ALIGNED, STARTED, RESULT, VARIANCE, FELT, TURNED = 0, 3, 4, 5, 6, 7, 9
 SHARED_SIZE = 10
-
-EXCUSED = 2.0
-"""This many times what the noise of GPS does is no disagreement: the models drift too."""
-
-WINDOW = 20
-"""Fixes over which what is felt is held against what GPS sees: 2 s at 10 Hz."""
 
 LONGEST = 64
 """Samples of the IMU that are kept until they are predicted: 0.25 s."""
@@ -305,17 +298,11 @@ class YawEstimator:
 
     Samples of the IMU are kept until a fix needs them: predicting them together costs a tenth of
     predicting each at its time, and comes to the same.
-
-    Whether a heading is what is wrong tells the motion that the IMU feels: under a wrong heading it
-    is what GPS sees, turned about the vertical, equally large and at an angle that stays. A wrong
-    tilt or gyro gives the two nothing in common (`explained`).
     """
 
     def __init__(self) -> None:
         """Begin without a tilt."""
-        self._felt: deque[complex] = deque(maxlen=WINDOW)
-        self._seen: deque[complex] = deque(maxlen=WINDOW)
-        self._seen_variance = 0.0
+        self._motion = TurnedMotion()
         self.models = np.zeros((N_MODELS, MODEL_SIZE))
         """(N_MODELS, MODEL_SIZE)"""
         self.models[:, ATTITUDE] = 1.0
@@ -360,44 +347,19 @@ class YawEstimator:
         self._advance()
         if flying:
             fuse(self.models, self._shared, velocity.item(0), velocity.item(1), accuracy)
-            self._felt.append(complex(*self._shared[FELT : FELT + 2].tolist()))
-            self._seen.append(complex(*velocity[:2].tolist()))
-            self._seen_variance = accuracy**2
+            self._motion.take(self._shared[FELT : FELT + 2], velocity[:2], accuracy)
             return
-        self._felt.clear()
-        self._seen.clear()
+        self._motion.restart()
         self._shared[STARTED], self._shared[VARIANCE] = 0.0, math.inf
         self.models[:, BIAS : BIAS + 3] = gyro_bias
 
     def explained(self, yaw: float) -> float:
-        """Return how much of what GPS and a heading disagree in, another heading would explain.
+        """Return how much of what GPS and a heading [rad] disagree in another would explain, 0 to 1.
 
-        Velocities over the newest `WINDOW` fixes are complex numbers less their means, u as the IMU
-        felt them under that heading and w as GPS saw them. Of the sums of squares
-
-            as they are  sum |w - u|^2             = |w|^2 + |u|^2 - 2 Re(u* w)
-            best turned  min sum |w - e^(i a) u|^2 = |w|^2 + |u|^2 - 2 |u* w|
-
-        `EXCUSED` times what the noise of GPS does is taken off. Source: G. Wahba, A Least Squares
-        Estimate of Satellite Attitude (SIAM Review 7(3), 1965), in the plane.
-
-        Args:
-            yaw: A heading [rad].
-
-        Returns:
-            Share, 0 to 1; 0 where they do not disagree.
+        See `turned_motion`.
         """
-        if not self._seen:
-            return 0.0
         along = self.models.item(0, YAW) - self._shared.item(TURNED)
-        u, w = np.array(self._felt) * cmath.exp(1j * (yaw - along)), np.array(self._seen)
-        u, w = u - u.mean(), w - w.mean()
-        common = complex(np.vdot(u, w))
-        power = float(np.vdot(u, u).real + np.vdot(w, w).real)
-        rest = power - 2.0 * EXCUSED * self._seen_variance * len(w)
-        turned = max(rest - 2.0 * abs(common), 0.0)
-        as_they_are = rest - 2.0 * common.real
-        return 1.0 - turned / as_they_are if as_they_are > turned else 0.0
+        return self._motion.explained(yaw - along)
 
     def _advance(self) -> None:
         if self._gyro:

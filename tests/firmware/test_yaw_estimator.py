@@ -109,7 +109,7 @@ def test_a_wrong_heading_is_explained_by_another(
     wrong = [
         estimator.explained(tick.yaw + math.radians(off_deg))
         for tick, estimator in observed(turned(ticks, 1.0))
-        if tick.flying and np.std(estimator._seen) > 0.9
+        if tick.flying and np.std(estimator._motion._seen) > 0.9
     ]
     assert len(wrong) > 10
     assert min(wrong) > least
