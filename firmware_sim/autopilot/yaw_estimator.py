@@ -354,7 +354,7 @@ class YawEstimator:
         self.models[:, BIAS : BIAS + 3] = gyro_bias
 
     def explained(self, yaw: float) -> float:
-        """Return how much of what GPS and a heading [rad] disagree in another would explain, 0 to 1.
+        """Return how much of what GPS and a heading [rad] disagree in another explains, 0 to 1.
 
         See `turned_motion`.
         """
