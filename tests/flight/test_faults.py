@@ -570,8 +570,8 @@ def test_stopped_firmware_gives_up_time_instead_of_racing(tmp_path: Path, ground
     """
     stopped_s = 1.0
     ports = choose_ports(ground.port)
-    # The watchdog counts simulated time: a busy host would let it be first now and then.
-    patient = ("--decision-timeout-s", "6", "--leave-after-s", "6")
+    # Watchdog and limits count simulated time: a second is three of it.
+    patient = ("--decision-timeout-s", "6", "--leave-after-s", "6", "--limits.silence-s", "6")
     with sitl(tmp_path, ports, "--episodes", "1", *patient, goal_m=25.0, program=ONCE) as run:
         children = run.find_children("firmware", "companion")
         ground.wait_flying(1.5, run)
