@@ -170,7 +170,7 @@ class Campaign:
             assert episode.navigation_us <= decided.min() <= decided.max() <= path.time_us[-1]
             check_log(self.out / f"flight-{episode.index:03d}.tlog", path.time_us)
         names = {path.name for path in self.out.iterdir()}
-        logs = {f"flight-{i:03d}.tlog" for i in range(self.episodes)}
+        logs = {f"flight-{i:03d}.{kind}" for i in range(self.episodes) for kind in ("tlog", "ulg")}
         assert names == logs | {
             *("run.json", "scenario.toml", "episodes.jsonl", "trajectories.npz", "latency.npz"),
             *("firmware.log", "companion.log"),
