@@ -139,9 +139,10 @@ def test_two_processes_show_their_flight_and_obey(tmp_path: Path) -> None:
 @pytest.mark.xdist_group("chromium")
 def test_a_browser_shows_the_flight(tmp_path: Path) -> None:
     pytest.importorskip("viser")
-    # Slowly, so that there is time to look.
+    # Slowly, so that there is time to look, and with nothing that the vehicle could be behind.
     words = (
         *("--level", "lockstep", "--episodes", "1", "--seed", "1", "--max-speed-m-s", "1"),
+        *("--arena", "no-obstacles"),
         *("--speed", "2", "--view", "--out", "run"),
     )
     with browser(tmp_path) as page, running([*SITL_WITHOUT_REPORT, *words], tmp_path) as sitl:
