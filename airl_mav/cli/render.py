@@ -200,9 +200,9 @@ def _drawn(options: RenderOptions, samples: int) -> Drawn:
     """Return what draws, with so many rays or paths a pixel."""
     if options.renderer == "mitsuba":
         # Imported here: what it draws with is an extra.
-        from airl_mav.camera.mitsuba import path_traced
+        from airl_mav.camera.mitsuba import PathTracer
 
-        return partial(path_traced, samples=samples)
+        return partial(PathTracer(samples), seed=0)
     rays = math.ceil(math.sqrt(samples))
     return partial(still, show=options.show, rays=rays, range_m=options.range_m)
 

@@ -156,7 +156,7 @@ class Aircraft(ProfileModel):
         " batch twin's compiled rigid body with contacts of its own, which needs no pybullet and"
         " is the default where that is not installed; level gym has neither",
     )
-    renderer: Annotated[Renderer, NO_TWIN] = Field(
+    renderer: Renderer = Field(
         default="raycast",
         description="what draws the images of a colour camera: the ray caster, or at level lockstep"
         " Mitsuba's path tracer, a hundred times slower",

@@ -169,7 +169,7 @@ def test_a_flight_sees_what_is_path_traced(policy: Path, tmp_path: Path) -> None
     ("changes", "accepted"),
     [
         ({"level": "sitl"}, "raycast, but at level lockstep"),
-        ({"level": "gym"}, "at level lockstep or sitl; the twin has none"),
+        ({"level": "gym"}, "raycast, but at level lockstep"),
         ({"shipped": "static-obstacles", "vehicle": "quad"}, "raycast with a depth camera"),
         ({"arena": "varied-looks"}, "raycast in an arena with fog"),
     ],
