@@ -41,6 +41,7 @@ NOT_THE_POLICYS_OWN = (
     "time_limit_s",
     "watchdog",
     "faults",
+    "renderer",
 )
 """Fields whose results are not written onto a policy's card when they are given."""
 

@@ -10,7 +10,7 @@ import pytest
 
 from airl_mav.camera.frame import Frame
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.core.errors import FieldError
+from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.envs.arenas import batch_of
 from airl_mav.envs.colour_images import ColourImages, Looks
 from airl_mav.envs.encoding import COMPILED
@@ -181,6 +181,13 @@ def test_where_nothing_is_path_traced_says_so(
     with pytest.raises(FieldError, match="renderer") as raised:
         scenario(flown, **({"renderer": "mitsuba"} | changes))
     assert accepted in str(raised.value)
+
+
+def test_what_was_path_traced_goes_onto_no_card(policy: Path) -> None:
+    pytest.importorskip("mitsuba")
+    words = ("--vehicle", "quad-rgb", "--level", "lockstep", "--renderer", "mitsuba", "--on-card")
+    with pytest.raises(UsageError, match="--renderer mitsuba: accepted: without on-card"):
+        airl("evaluate", str(policy), *words)
 
 
 def test_what_does_not_see_alike_is_refused_in_one_line(policy: Path) -> None:
