@@ -25,8 +25,8 @@ from firmware_sim.mavlink.link import gcs_link, onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.simulation import EpisodeSetup, Simulation, builtin_autopilot
 
-TICKS = 400
-"""Enough for the estimator to converge and the vehicle to arm and spin."""
+TICKS = 1300
+"""Enough for the vehicle to arm, spin and fly: some kernels are asked for only in the air."""
 
 
 def warm_up(vehicle: VehicleProfile, plant: PlantName = DEFAULT_PLANT) -> None:

@@ -1,0 +1,37 @@
+"""Nothing is compiled, or loaded, in flight: a tick has 4 ms."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tests.support.processes import run_alone
+
+PROGRAM = """
+import gc
+from numba.core.dispatcher import Dispatcher
+from firmware_sim.autopilot.autopilot_state import Mode
+from firmware_sim.warm_up import warm_up
+from tests.support.flight_rig import flight, quad, velocity_setpoint
+
+def compiled():
+    kernels = (each for each in gc.get_objects() if isinstance(each, Dispatcher))
+    return {(each.__module__, each.__name__): len(each.signatures) for each in kernels}
+
+warm_up(quad())
+before = compiled()
+with flight(1) as rig:
+    rig.take_off(2.5)
+    rig.go_offboard(velocity_setpoint(2.0, 0.0, 0.0))
+    rig.run(2.0)
+    rig.ap.set_mode(Mode.LAND)
+    rig.run(6.0)
+after = compiled()
+assert len(after) > 20, after
+new = {name: count for name, count in after.items() if before.get(name) != count}
+assert not new, new
+"""
+
+
+def test_a_flight_asks_for_no_kernel_that_was_not_there_before(tmp_path: Path) -> None:
+    done = run_alone(PROGRAM, tmp_path)
+    assert done.returncode == 0, done.stderr
