@@ -17,6 +17,6 @@ def folder_of(path: Path, ulg: Path | None = None) -> Path:
         return path
     check_installed("black-box" if ulg is None else "refit")
     # Imported here: MCAP is an extra.
-    from airl_mav.report.recorded_flight import take_in
+    from airl_mav.report.recording_folder import take_in
 
     return take_in(path, ulg)

@@ -1,10 +1,8 @@
-"""A black box as a run of one flight, which every report and comparison reads."""
+"""The flight that a black box holds, as reports and comparisons read it."""
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
@@ -12,24 +10,16 @@ from numpy.typing import NDArray
 from pydantic import Field, TypeAdapter
 
 from airl_mav.black_box.messages import Decision, End, Phase, Resources, Status, Telemetry
-from airl_mav.black_box.reading import BlackBox, read_black_box
+from airl_mav.black_box.reading import BlackBox
 from airl_mav.core.constants import US_PER_S
-from airl_mav.core.errors import UsageError
-from airl_mav.core.files import sha256_of, typed
+from airl_mav.core.files import typed
 from airl_mav.core.process_use import ProcessUse
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.quality import measure_quality
 from airl_mav.flight.record import NO_ARENA, EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.stamps import NO_STAMP, STAMPS
-from airl_mav.rehearsal.run_folder import (
-    RUN_FILE,
-    FlownEpisode,
-    RunFolder,
-    RunInfo,
-    load_info,
-    run_info,
-)
+from airl_mav.rehearsal.run_folder import FlownEpisode, RunInfo, run_info
 from companion.limits import OUT_OF_TIME
 
 NAVIGATING = "navigating"
@@ -74,46 +64,6 @@ _SETTINGS = TypeAdapter(FlownSettings)
 def settings_of(box: BlackBox) -> FlownSettings:
     """Return what was asked for. Raises UsageError where the black box does not hold it."""
     return typed(_SETTINGS, box.run.get("config", {}), box.path)
-
-
-WITH_LOG = "-with-log"
-"""Ends the name of the run folder of a flight with the vehicle's own log."""
-
-
-def take_in(path: Path, ulg: Path | None = None) -> Path:
-    """Make the run folder of a black box, beside it, and return it; it may be there already.
-
-    Args:
-        path: The black box.
-        ulg: The vehicle's own log of the flight; None: what the companion recorded is all.
-
-    Raises:
-        UsageError: The file is no black box, the log is of another flight, or the folder holds
-            something else.
-    """
-    box = read_black_box(path)
-    folder = path.with_suffix("") if ulg is None else path.with_name(f"{path.stem}{WITH_LOG}")
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    if ulg is not None:
-        # Imported here: pyulog is an extra.
-        from airl_mav.vehicle_log.ulog import read_vehicle_log
-
-        log = read_vehicle_log(ulg)
-        digest = hashlib.sha256(f"{digest} {sha256_of(ulg)}".encode()).hexdigest()
-    if (folder / RUN_FILE).exists():
-        if load_info(folder).config.get(DIGEST) != digest:
-            raise UsageError(
-                f"{folder}: holds another run; accepted: that of {path.name}, or no such folder"
-            )
-        return folder
-    if ulg is None:
-        episode = episode_of(box)
-    else:
-        from airl_mav.report.logged_flight import logged_episode_of
-
-        episode = logged_episode_of(box, log)
-    RunFolder.adopt(folder, info_of(box, digest)).save_episodes([episode])
-    return folder
 
 
 def info_of(box: BlackBox, digest: str = "") -> RunInfo:

@@ -27,7 +27,8 @@ from airl_mav.flight.setup import Setup
 from airl_mav.latency.stamps import STAMPS
 from airl_mav.lockstep.stage import Stage
 from airl_mav.report.comparison.runs import compare_folders
-from airl_mav.report.recorded_flight import episode_of, take_in
+from airl_mav.report.recorded_flight import episode_of
+from airl_mav.report.recording_folder import take_in
 from airl_mav.scenario.model import PilotSettings
 from airl_mav.scenario.piloting import TRANSPORT_US
 from airl_mav.scenario.stand_alone import StandAloneCompanion

@@ -36,7 +36,7 @@ from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.refitting.flown import flown_of
 from airl_mav.refitting.refit import Refit, refit
 from airl_mav.rehearsal.run_folder import load
-from airl_mav.report.recorded_flight import take_in
+from airl_mav.report.recording_folder import take_in
 from airl_mav.report.tracking import track
 from airl_mav.scenario.file import read_scenario_file
 from airl_mav.scenario.model import Scenario
