@@ -8,9 +8,9 @@ from importlib.util import find_spec
 from airl_mav.core.errors import FieldError
 from airl_mav.faults.model import Fault
 from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.camera_kind import Renderer
 from airl_mav.profiles.conditions import SensorNoise
-from airl_mav.profiles.vehicle import Camera
 
 
 def check_noise(

@@ -12,7 +12,7 @@ from airl_mav.profiles.camera_kind import CameraKind, shape_of
 from airl_mav.profiles.projection import Projection
 
 if TYPE_CHECKING:  # A frame source needs no models of profiles.
-    from airl_mav.profiles.vehicle import Camera
+    from airl_mav.profiles.camera import Camera
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from airl_mav.camera.frame import MAX_MM, MM_PER_M
 from airl_mav.camera.stereo import Matching, matched_depth, matching_of
 from airl_mav.core.streams import Stream, stream
+from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.conditions import SensorNoise
-from airl_mav.profiles.vehicle import Camera
 
 NOISE_AT_M = 10.0
 """Depth at which the noise is as declared; stereo noise grows with the square of the depth."""

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from airl_mav.camera.frame import MAX_MM, MM_PER_M
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.kernels import kernel
-from airl_mav.profiles.vehicle import Camera
+from airl_mav.profiles.camera import Camera
 
 
 class Matching(NamedTuple):

@@ -26,8 +26,8 @@ from airl_mav.envs.fleet import Fleet
 from airl_mav.envs.saved_state import Stateful
 from airl_mav.faults.kinds import NOISE_SEED
 from airl_mav.faults.model import Fault
+from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.conditions import SensorNoise
-from airl_mav.profiles.vehicle import Camera
 
 NEVER = 1 << 40
 """More ticks than any flight has."""

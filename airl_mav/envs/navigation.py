@@ -56,11 +56,12 @@ from airl_mav.policy.observation import Kinematics, Observation, Rows, observe
 from airl_mav.policy.observation_spec import Encoded, ObservationSpec, camera_mismatch
 from airl_mav.prediction.compensator import Compensator
 from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.conditions import Payload
 from airl_mav.profiles.loaded import check_spread, equipped
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.parameters import flown_values
-from airl_mav.profiles.vehicle import Camera, VehicleProfile
+from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.vehicle.spread import draw_airframe, spreads
 
 EVERYONE = slice(None)

@@ -14,10 +14,11 @@ from airl_mav.flight.judge import GOAL_RADIUS_M, TIME_LIMIT_S, GoalRadius, TimeL
 from airl_mav.policy.action_sets import PAPER_SPEED_M_S, ActionSetName, ActionSpec
 from airl_mav.policy.actions import DecisionTiming
 from airl_mav.policy.observation_spec import STRIP_ROWS, Frames, LayoutName, Told
+from airl_mav.profiles.camera import Camera, check_matched
 from airl_mav.profiles.camera_kind import CameraKind
 from airl_mav.profiles.conditions import SensorNoise, Spread, WindSettings
 from airl_mav.profiles.projection import CYLINDER_MOST_DEG, Projection, check_fov
-from airl_mav.profiles.vehicle import Camera, check_matched, load_vehicle
+from airl_mav.profiles.vehicle import load_vehicle
 
 SHIPPED_REWARDS = ("shaped", "timed", "paper-scaled", "paper")
 """See `envs.rewards`."""

@@ -23,7 +23,7 @@ from airl_mav.policy.actions import DecisionTiming
 from airl_mav.policy.observation_spec import SHIPPED as SHIPPED_LAYOUTS
 from airl_mav.policy.observation_spec import ObservationSpec, camera_mismatch
 from airl_mav.policy.runtime import OnnxRuntime
-from airl_mav.profiles.vehicle import Camera
+from airl_mav.profiles.camera import Camera
 
 SCHEMA = 1
 """Version of the card's fields."""

@@ -17,8 +17,8 @@ from airl_mav.policy.card import CARD_FILE, ONNX_FILE, PolicyCard, load_card, ve
 from airl_mav.policy.greedy import GreedyPolicy, GreedySettings
 from airl_mav.policy.learned import load_learned
 from airl_mav.policy.runtime import RuntimeName
+from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.loading import profiles_dir
-from airl_mav.profiles.vehicle import Camera
 
 POLICIES: dict[str, tuple[str, Callable[[float], Policy]]] = {
     "greedy": (

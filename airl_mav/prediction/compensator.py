@@ -29,7 +29,8 @@ from airl_mav.policy.observation import Kinematics
 from airl_mav.prediction.memory import DecisionMemory
 from airl_mav.prediction.motion import Motion, flown_on, leaning
 from airl_mav.prediction.reprojection import CameraPose, Reprojector, Sight
-from airl_mav.profiles.vehicle import Camera, VehicleProfile
+from airl_mav.profiles.camera import Camera
+from airl_mav.profiles.vehicle import VehicleProfile
 
 LINK_US = round(4.0 * US_PER_MS)
 """A setpoint is taken to be in effect so long after it was sent [µs]: a tick of the flight

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from airl_mav.camera.frame import MAX_MM, MM_PER_M
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.profiles.vehicle import Camera
+from airl_mav.profiles.camera import Camera
 
 LEAST_DEPTH_M = 0.05
 """Points closer to the image plane, or a cylinder's axis, are left out [m]: they have no pixel."""

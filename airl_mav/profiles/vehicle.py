@@ -1,24 +1,18 @@
-"""The vehicle profile: airframe, rotors, drag, battery, power model, camera, parameters."""
+"""The vehicle profile: airframe, rotors, drag, battery, power model, sensors, parameters."""
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from pydantic import (
-    Field,
-    SerializerFunctionWrapHandler,
-    Strict,
-    model_serializer,
-    model_validator,
-)
+from pydantic import Field, Strict, model_validator
 
-from airl_mav.core.constants import C_PER_MAH, GRAVITY_M_S2, US_PER_S
+from airl_mav.core.constants import C_PER_MAH, GRAVITY_M_S2
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import ProfileModel, quantity
-from airl_mav.profiles.camera_kind import CameraKind
+from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.parameters import SPECS, parameter_values
-from airl_mav.profiles.projection import CYLINDER_MOST_DEG, Projection, check_fov
+from airl_mav.profiles.sensors import Sensors
 
 
 class Body(ProfileModel):
@@ -162,135 +156,6 @@ class Regression(ProfileModel):
     b7_payload: float = quantity("payload", "W/g", ge=-100, le=100)
     b8_wind: float = quantity("ground velocity . wind", "W/(m²/s²)", ge=-1000, le=1000)
     b9_hover: float = quantity("hover", "W", ge=0, le=100_000)
-
-
-class Stereo(ProfileModel):
-    """How a depth camera matches the images of two imagers; see `camera.stereo`."""
-
-    baseline_m: float = quantity("distance between the imagers", "m", ge=0.01, le=1)
-    focal_px: float = quantity(
-        "focal length of the imagers, at the resolution that is matched", "px", ge=10, le=5000
-    )
-    noise_px: float = quantity("disparity noise, sd of a pixel", "px", ge=0, le=5)
-    step_px: float = quantity("step of the disparity; 0: none", "px", ge=0, le=1)
-    most_px: float = quantity(
-        "greatest disparity that is searched: sets the least depth", "px", ge=1, le=1000
-    )
-
-
-class Camera(ProfileModel):
-    """The camera, which looks ahead or all round."""
-
-    kind: CameraKind = Field(
-        default="depth",
-        description="what its pixels are: depth; rgb, sRGB colours of 8 bits a channel; or grey,"
-        " their luma (ITU-R BT.601)",
-    )
-    projection: Projection = Field(
-        default="pinhole",
-        description="pinhole, or cylindrical for a field of view of up to 360 deg",
-    )
-    width_px: int = quantity("image width", "px", ge=8, le=640)
-    height_px: int = quantity("image height", "px", ge=6, le=480)
-    horizontal_fov_deg: float = quantity(
-        "horizontal field of view, less than 170 with a pinhole",
-        "deg",
-        gt=10,
-        le=CYLINDER_MOST_DEG,
-    )
-    range_m: float = quantity(
-        "farthest depth returned; rgb and grey cameras see without limit", "m", gt=0.5, le=65
-    )
-    rate_hz: float = quantity("frames a second", "Hz", ge=1, le=125)
-    forward_m: float = quantity("mount ahead of the centre of mass", "m", ge=-2, le=2)
-    up_m: float = quantity("mount above the centre of mass", "m", ge=-2, le=2)
-    pitch_up_deg: float = quantity("mount angle, positive looks up", "deg", ge=-90, le=90)
-    stereo: Stereo | None = Field(
-        default=None,
-        description="how depth is matched, of a depth camera with a pinhole; left out: depth"
-        " without error",
-    )
-
-    @model_validator(mode="after")
-    def _projects(self) -> Camera:
-        check_fov("camera.horizontal_fov_deg", self.projection, self.horizontal_fov_deg)
-        if self.stereo is not None and self.projection != "pinhole":
-            raise FieldError(
-                "camera.stereo", self.projection, "left out where the projection is not pinhole"
-            )
-        check_matched("camera.kind", self)
-        return self
-
-    @model_serializer(mode="wrap")
-    def _without_the_default(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        # Profiles that say neither kind nor projection nor stereo matching keep their digests.
-        data: dict[str, Any] = dump(self)
-        if self.kind == "depth":
-            data.pop("kind", None)
-        if self.projection == "pinhole":
-            data.pop("projection", None)
-        if self.stereo is None:
-            data.pop("stereo", None)
-        return data
-
-    @property
-    def period_us(self) -> int:
-        """Time between two frames [µs]."""
-        return round(US_PER_S / self.rate_hz)
-
-
-def check_matched(field: str, camera: Camera) -> None:
-    """Raise FieldError, naming the field, for stereo matching where no depth is measured."""
-    if camera.stereo is not None and camera.kind != "depth":
-        raise FieldError(
-            field, camera.kind, problem="with a table camera.stereo; accepted: 'depth' with one"
-        )
-
-
-class Imu(ProfileModel):
-    """Accelerometer and gyroscope: white noise, bias at start, bias random walk."""
-
-    accel_noise_m_s2: float = quantity("white noise, sd of a sample", "m/s²", ge=0, le=10)
-    accel_bias_m_s2: float = quantity("start bias, sd", "m/s²", ge=0, le=2)
-    accel_walk_m_s2_sqrt_s: float = quantity("bias random walk", "m/s²/sqrt(s)", ge=0, le=0.1)
-    gyro_noise_rad_s: float = quantity("white noise, sd of a sample", "rad/s", ge=0, le=1)
-    gyro_bias_rad_s: float = quantity("start bias, sd", "rad/s", ge=0, le=0.2)
-    gyro_walk_rad_s_sqrt_s: float = quantity("bias random walk", "rad/s/sqrt(s)", ge=0, le=0.01)
-
-
-class Magnetometer(ProfileModel):
-    """Three-axis magnetometer, calibrated."""
-
-    rate_hz: float = quantity("sample rate", "Hz", ge=1, le=250)
-    noise_gauss: float = quantity("white noise, sd of a sample", "gauss", ge=0, le=0.1)
-
-
-class Barometer(ProfileModel):
-    """Static pressure sensor."""
-
-    rate_hz: float = quantity("sample rate", "Hz", ge=1, le=250)
-    noise_pa: float = quantity("white noise, sd of a sample", "Pa", ge=0, le=100)
-    drift_pa_sqrt_s: float = quantity("drift random walk", "Pa/sqrt(s)", ge=0, le=10)
-
-
-class Gps(ProfileModel):
-    """GPS receiver."""
-
-    rate_hz: float = quantity("fixes a second", "Hz", ge=1, le=25)
-    horizontal_noise_m: float = quantity("white noise, sd", "m", ge=0, le=10)
-    vertical_noise_m: float = quantity("white noise, sd", "m", ge=0, le=20)
-    velocity_noise_m_s: float = quantity("white noise, sd per axis", "m/s", ge=0, le=2)
-    drift_m_sqrt_s: float = quantity("position drift random walk", "m/sqrt(s)", ge=0, le=1)
-    drift_time_constant_s: float = quantity("the drift decays with", "s", gt=1, le=10_000)
-
-
-class Sensors(ProfileModel):
-    """The sensor suite."""
-
-    imu: Imu
-    magnetometer: Magnetometer
-    barometer: Barometer
-    gps: Gps
 
 
 class Estimation(ProfileModel):

@@ -19,9 +19,9 @@ from airl_mav.camera.render import Mount, camera_pose
 from airl_mav.core.constants import DEG
 from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import Vector
+from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.camera_kind import Renderer
 from airl_mav.profiles.conditions import SensorNoise
-from airl_mav.profiles.vehicle import Camera
 from firmware_sim.plant.sensors import Rate
 
 

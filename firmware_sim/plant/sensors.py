@@ -10,7 +10,7 @@ from airl_mav.core.constants import TICK_S, US_PER_S
 from airl_mav.core.frames import Vector, local_to_geodetic
 from airl_mav.core.kernels import kernel
 from airl_mav.core.location import HOME, MAGNETIC_FIELD_NED
-from airl_mav.profiles.vehicle import Barometer, Gps, Magnetometer, Sensors
+from airl_mav.profiles.sensors import Barometer, Gps, Magnetometer, Sensors
 from airl_mav.vehicle.atmosphere import pressure_hpa, temperature_c
 from airl_mav.vehicle.rotation import conjugate, rotate
 from firmware_sim.interfaces import BatterySample, GpsFix, SensorSample

@@ -18,7 +18,8 @@ from airl_mav.core.frames import Vector
 from airl_mav.core.location import HOME
 from airl_mav.profiles.conditions import WindSettings
 from airl_mav.profiles.loading import load_profile
-from airl_mav.profiles.vehicle import Sensors, VehicleProfile
+from airl_mav.profiles.sensors import Sensors
+from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import HAS_PYBULLET, Aircraft, PlantName
 from airl_mav.vehicle import wind as wind_module
 from airl_mav.vehicle.wind import Wind

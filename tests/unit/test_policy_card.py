@@ -27,7 +27,8 @@ from airl_mav.policy.card import (
     vehicle_mismatch,
 )
 from airl_mav.policy.card_writing import write_card
-from airl_mav.profiles.vehicle import Camera, load_vehicle
+from airl_mav.profiles.camera import Camera
+from airl_mav.profiles.vehicle import load_vehicle
 from tests.support.policy_kit import SPEC, export_tiny, facts
 
 

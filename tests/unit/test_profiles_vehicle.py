@@ -21,15 +21,10 @@ from pydantic.fields import FieldInfo
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.errors import UsageError, shown
 from airl_mav.core.fields import ProfileModel, quantity, range_of, unit_of
+from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.loading import Kind, list_profiles, load_profile, profiles_dir
 from airl_mav.profiles.parameters import SPECS, ParameterSpec, flown_values
-from airl_mav.profiles.vehicle import (
-    Camera,
-    Momentum,
-    Regression,
-    VehicleProfile,
-    load_vehicle,
-)
+from airl_mav.profiles.vehicle import Momentum, Regression, VehicleProfile, load_vehicle
 from firmware_sim.autopilot.parameter_store import Parameters
 
 ROOT = Path(__file__).resolve().parents[2]

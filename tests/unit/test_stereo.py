@@ -10,7 +10,8 @@ import pytest
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.stereo import Matching, matched_depth, matching_of
 from airl_mav.core.errors import UsageError
-from airl_mav.profiles.vehicle import Stereo, VehicleProfile, load_vehicle
+from airl_mav.profiles.camera import Stereo
+from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 
 D435 = load_vehicle("quad-d435").camera
 WIDE = Intrinsics.from_fov(128, 72, math.radians(87.0))

@@ -14,7 +14,7 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import Mount, camera_pose, render
 from airl_mav.control.attitude import heading_of
 from airl_mav.flight.trajectory import Trajectory
-from airl_mav.profiles.vehicle import Camera
+from airl_mav.profiles.camera import Camera
 
 Floats = NDArray[np.float64]
 

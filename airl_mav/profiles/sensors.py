@@ -1,0 +1,51 @@
+"""The sensors of a vehicle profile, but its camera: inertial, magnetic, pressure, GPS."""
+
+from __future__ import annotations
+
+from airl_mav.core.fields import ProfileModel, quantity
+
+
+class Imu(ProfileModel):
+    """Accelerometer and gyroscope: white noise, bias at start, bias random walk."""
+
+    accel_noise_m_s2: float = quantity("white noise, sd of a sample", "m/s²", ge=0, le=10)
+    accel_bias_m_s2: float = quantity("start bias, sd", "m/s²", ge=0, le=2)
+    accel_walk_m_s2_sqrt_s: float = quantity("bias random walk", "m/s²/sqrt(s)", ge=0, le=0.1)
+    gyro_noise_rad_s: float = quantity("white noise, sd of a sample", "rad/s", ge=0, le=1)
+    gyro_bias_rad_s: float = quantity("start bias, sd", "rad/s", ge=0, le=0.2)
+    gyro_walk_rad_s_sqrt_s: float = quantity("bias random walk", "rad/s/sqrt(s)", ge=0, le=0.01)
+
+
+class Magnetometer(ProfileModel):
+    """Three-axis magnetometer, calibrated."""
+
+    rate_hz: float = quantity("sample rate", "Hz", ge=1, le=250)
+    noise_gauss: float = quantity("white noise, sd of a sample", "gauss", ge=0, le=0.1)
+
+
+class Barometer(ProfileModel):
+    """Static pressure sensor."""
+
+    rate_hz: float = quantity("sample rate", "Hz", ge=1, le=250)
+    noise_pa: float = quantity("white noise, sd of a sample", "Pa", ge=0, le=100)
+    drift_pa_sqrt_s: float = quantity("drift random walk", "Pa/sqrt(s)", ge=0, le=10)
+
+
+class Gps(ProfileModel):
+    """GPS receiver."""
+
+    rate_hz: float = quantity("fixes a second", "Hz", ge=1, le=25)
+    horizontal_noise_m: float = quantity("white noise, sd", "m", ge=0, le=10)
+    vertical_noise_m: float = quantity("white noise, sd", "m", ge=0, le=20)
+    velocity_noise_m_s: float = quantity("white noise, sd per axis", "m/s", ge=0, le=2)
+    drift_m_sqrt_s: float = quantity("position drift random walk", "m/sqrt(s)", ge=0, le=1)
+    drift_time_constant_s: float = quantity("the drift decays with", "s", gt=1, le=10_000)
+
+
+class Sensors(ProfileModel):
+    """The sensor suite."""
+
+    imu: Imu
+    magnetometer: Magnetometer
+    barometer: Barometer
+    gps: Gps
