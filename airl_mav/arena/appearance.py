@@ -53,6 +53,19 @@ class Finish:
 
 
 @dataclass(frozen=True)
+class Statics:
+    """What the primitives that stand belong to, where some are parts of one asset."""
+
+    names: tuple[str, ...]  # (k,) a shape's or an asset's, of each thing that stands
+    of: NDArray[np.int64]  # (n_static,) the thing that each primitive is a part of, ascending
+    materials: tuple[str | None, ...]  # (n_static,) None: the one that is drawn for the thing
+
+    def name_of(self, i: int) -> str:
+        """Return what primitive i is a part of."""
+        return self.names[int(self.of[i])]
+
+
+@dataclass(frozen=True)
 class Light:
     """Sun, sky and fog. A white surface under the irradiance 1 reads full scale."""
 
@@ -87,25 +100,34 @@ def draw_appearance(
     n_static: int,
     n_moving: int,
     wall_colour: Rgb,
+    statics: Statics | None = None,
 ) -> Drawn:
     """Draw the appearance of an arena. Same arguments, same appearance.
 
     Args:
         appearance: Knobs.
         seed: Of the arena; runs of `appearance.period` seeds share what is drawn.
-        n_static: Number of obstacles that stand still.
+        n_static: Number of primitives that stand still.
         n_moving: Number of obstacles that move.
         wall_colour: sRGB of the material `wall_colour`, 0-255.
+        statics: What those that stand are parts of; None: each is a thing of its own.
     """
     draw = seed // appearance.period
     kinds: list[tuple[_Part, Surfaces, int]] = [
         (_Part.FLOOR, appearance.floor, 1),
         (_Part.WALLS, appearance.walls, 1),
-        (_Part.STATIC, appearance.static, n_static),
+        (_Part.STATIC, appearance.static, n_static if statics is None else len(statics.names)),
         (_Part.MOVING, appearance.moving, n_moving),
     ]
     rows = [
-        _surfaces(stream(draw, Stream.APPEARANCE, part), n, kind, appearance, wall_colour)
+        _surfaces(
+            stream(draw, Stream.APPEARANCE, part),
+            n,
+            kind,
+            appearance,
+            wall_colour,
+            statics if part is _Part.STATIC else None,
+        )
         for part, kind, n in kinds
         if n
     ]
@@ -119,15 +141,22 @@ def _surfaces(
     kind: Surfaces,
     appearance: Appearance,
     wall_colour: Rgb,
+    statics: Statics | None,
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Draw n surfaces of a kind: texture, albedos, size and offset, as in `Finish`.
 
     Everything is drawn whether or not it is used, and surface by surface: neither a knob nor the
-    number of surfaces changes the other draws.
+    number of surfaces changes the other draws. The parts of a thing of `statics` share its draws.
     """
     draws = rng.random((n, 7))
     materials = [appearance.material(name, wall_colour) for name in kind.materials]
     chosen = (draws[:, 0] * len(materials)).astype(np.intp)
+    if statics is not None:
+        draws, chosen = draws[statics.of], chosen[statics.of]
+        for part, name in enumerate(statics.materials):
+            if name is not None:
+                chosen[part] = len(materials)
+                materials.append(appearance.material(name, wall_colour))
     dark, bright = kind.brightness
     factor = (dark + (bright - dark) * draws[:, 1, None]) * (
         1.0 + kind.tint * (2.0 * draws[:, 2:5] - 1.0)

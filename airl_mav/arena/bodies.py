@@ -16,6 +16,9 @@ from airl_mav.profiles.arena import SPHERE_OFFSET, StaticObstacles
 
 _BOX, _SPHERE = int(Shape.BOX), int(Shape.SPHERE)
 
+NUMBERS = 5
+"""Numbers that are drawn for each body."""
+
 
 @dataclass(frozen=True)
 class Bodies:
@@ -48,13 +51,23 @@ def draw_bodies(
     allowed = _shapes(kind.shapes)
     shape = allowed[rng.integers(len(allowed), size=n)]
     # Drawn here: numba needs longer to take a generator than numpy to draw all of them.
-    numbers = rng.random(5 * n)
+    bodies = bodies_of(rng.random(NUMBERS * n), shape, kind, altitude_m)
+    _widest_first(
+        bodies.shape, bodies.half_size, bodies.yaw, bodies.center_height, bodies.bounding_half
+    )
+    return bodies
+
+
+def bodies_of(
+    numbers: Floats, shape: NDArray[np.int8], kind: StaticObstacles, altitude_m: float
+) -> Bodies:
+    """Return bodies of a shape (n,) as `numbers` (NUMBERS n,) make them; see `_size`."""
+    n = len(shape)
     half_size, yaw, center_height = np.empty((n, 3)), np.empty(n), np.empty(n)
     _size(
         numbers, shape, kind.half_width_m, kind.height_m, altitude_m, half_size, yaw, center_height
     )
     half = bounding_half(shape, half_size, yaw)
-    _widest_first(shape, half_size, yaw, center_height, half)
     return Bodies(shape, half_size, yaw, center_height, half)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 
 import numpy as np
 from rich.table import Table
@@ -39,8 +40,12 @@ def arena_table(arena: Arena, spec: ArenaSpec) -> Table:
 
 
 def _shapes(arena: Arena, *, moving: bool) -> str:
-    """Return how many obstacles of each shape there are: "7 (4 box, 3 sphere)"."""
-    n = arena.n_static
+    """Return how many obstacles of each kind there are: "7 (4 box, 3 sphere)"."""
+    n, statics = arena.n_static, arena.statics
+    if statics is not None and not moving:
+        counts = sorted(Counter(statics.names).items())
+        each = ", ".join(f"{count} {name}" for name, count in counts)
+        return f"{len(statics.names)} ({each})" if each else "0"
     shapes = arena.obstacles.shape[n:] if moving else arena.obstacles.shape[:n]
     kinds = [f"{k} {shape.name.lower()}" for shape in Shape if (k := int((shapes == shape).sum()))]
     return f"{len(shapes)} ({', '.join(kinds)})" if kinds else "0"

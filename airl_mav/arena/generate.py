@@ -8,11 +8,13 @@ from functools import cached_property
 
 import numpy as np
 
-from airl_mav.arena.bodies import draw_bodies
+from airl_mav.arena.appearance import Statics
+from airl_mav.arena.assets import Things, draw_things
+from airl_mav.arena.bodies import Bodies, draw_bodies
 from airl_mav.arena.footprints import Boxes, Floats, footprint_areas, join
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Tour
 from airl_mav.arena.own import generate_own
-from airl_mav.arena.passage import passage_exists
+from airl_mav.arena.passage import free_share, passage_exists
 from airl_mav.arena.placement import TRIES, NoRoomError, place_all
 from airl_mav.arena.tours import draw_tours
 from airl_mav.arena.zones import draw_goal, zone_radius_m
@@ -89,7 +91,7 @@ def generate(
     failure = NoRoomError("", -1)
     for _ in range(LAYOUTS):
         try:
-            static, standing = _draw_static(static_rng, request)
+            static, standing, statics = _draw_static(static_rng, request)
             goal = _draw_reachable_goal(goal_rng, request, static, standing)
             moving, tours = _draw_moving(moving_rng, request, standing)
         except NoRoomError as error:
@@ -104,6 +106,7 @@ def generate(
             tours=tours,
             goal=goal,
             appearance=spec.appearance,
+            statics=statics,
         )
     raise UsageError(f"arena {name!r}, seed {seed}: {failure} (best of {LAYOUTS} layouts)")
 
@@ -121,9 +124,11 @@ def local_bounds(spec: ArenaSpec) -> Bounds:
 
 def free_area_fraction(arena: Arena) -> float:
     """Return the share of the floor that no static obstacle covers, seen from above."""
-    b = arena.bounds
+    b, n = arena.bounds, arena.n_static
+    if arena.statics is not None:  # Parts of one thing are above each other.
+        return free_share(b, arena.obstacles, n)
     floor = (b.north_max - b.north_min) * (b.east_max - b.east_min)
-    return 1.0 - float(footprint_areas(arena.obstacles)[: arena.n_static].sum()) / floor
+    return 1.0 - float(footprint_areas(arena.obstacles)[:n].sum()) / floor
 
 
 def _rng(seed: int, stream: _Stream) -> np.random.Generator:
@@ -151,10 +156,17 @@ def _check_fixed_goal(request: _Request, zone: int | None) -> None:
         )
 
 
-def _draw_static(rng: np.random.Generator, request: _Request) -> tuple[Obstacles, Boxes]:
-    """Draw and place the static obstacles; return their bounding boxes as well."""
+def _draw_static(
+    rng: np.random.Generator, request: _Request
+) -> tuple[Obstacles, Boxes, Statics | None]:
+    """Draw and place the static obstacles; return their bounding boxes and parts as well."""
     spec, (n, _) = request.spec, request.counts
-    bodies = draw_bodies(rng, n, spec.static, spec.flight_altitude_m)
+    bodies: Bodies | Things
+    if spec.has_assets:
+        bodies = things = draw_things(rng, n, spec)
+        statics: Statics | None = things.statics
+    else:
+        bodies, statics = draw_bodies(rng, n, spec.static, spec.flight_altitude_m), None
     keep_off = request.start_box
     if spec.goal.fixed is not None:
         keep_off = join(keep_off, _around(np.array(spec.goal.fixed), spec.goal.clearance_m))
@@ -172,7 +184,7 @@ def _draw_static(rng: np.random.Generator, request: _Request) -> tuple[Obstacles
             f"{spec.size.east_m:g} m floor",
             error.progress,
         ) from None
-    return bodies.at(places), Boxes(places, bodies.bounding_half)
+    return bodies.at(places), Boxes(places, bodies.bounding_half), statics
 
 
 def _draw_reachable_goal(
@@ -194,7 +206,7 @@ def _draw_reachable_goal(
                 f"goal.clearance_m {spec.goal.clearance_m:g}, among {len(static)} static obstacles",
                 progress,
             )
-        if passage_exists(request.bounds, static, goal, request.vehicle_width_m):
+        if passage_exists(request.bounds, static, goal, request.vehicle_width_m, standing):
             return goal
     raise NoRoomError(
         f"no way {request.vehicle_width_m:g} m wide from the start to the goal among "

@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.appearance import Drawn, draw_appearance
+from airl_mav.arena.appearance import Drawn, Statics, draw_appearance
 from airl_mav.core.constants import US_PER_S
 from airl_mav.profiles.appearance import DEFAULT, Appearance
 
@@ -83,17 +83,32 @@ class Arena:
     goal: NDArray[np.float64]  # (2,) north, east [m] from the start
     appearance: Appearance = DEFAULT
     """What the look is drawn from; geometry and depth know none of it."""
+    statics: Statics | None = None
+    """None: every primitive that stands is a thing of its own."""
 
     @cached_property
     def look(self) -> Drawn:
         """Materials of all surfaces, and the light; drawn when it is first asked for."""
-        moving = len(self.tours)
-        return draw_appearance(self.appearance, self.seed, self.n_static, moving, self.wall_colour)
+        return draw_appearance(
+            self.appearance,
+            self.seed,
+            self.n_static,
+            len(self.tours),
+            self.wall_colour,
+            self.statics,
+        )
 
     @property
     def n_static(self) -> int:
         """Number of obstacles that stand still."""
         return len(self.obstacles) - len(self.tours)
+
+    def name_of(self, i: int) -> str:
+        """Return what obstacle i is called where it is hit: "static-box-3", "static-tree-7"."""
+        shape = Shape(int(self.obstacles.shape[i])).name.lower()
+        if i >= self.n_static:
+            return f"moving-{shape}-{i}"
+        return f"static-{shape if self.statics is None else self.statics.name_of(i)}-{i}"
 
     def centers_at(self, time_us: int) -> NDArray[np.float64]:
         """Return all obstacle centres (n, 3) NED [m], `time_us` after the episode's start."""

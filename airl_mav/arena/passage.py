@@ -11,7 +11,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from airl_mav.arena.footprints import Floats, bounding_boxes, inner, outside
+from airl_mav.arena.footprints import Boxes, Floats, bounding_boxes, inner, outside
 from airl_mav.arena.geometry import Bounds, Obstacles, Shape
 from airl_mav.core.kernels import kernel
 
@@ -21,20 +21,30 @@ CELL_M = 0.25
 CELLS_MAX = 250_000
 
 
-def passage_exists(bounds: Bounds, obstacles: Obstacles, goal: Floats, width_m: float) -> bool:
-    """Return whether a disc `width_m` [m] wide can be moved from the origin to `goal` (2,) [m]."""
-    return gaps_suffice(bounds, obstacles, goal, width_m) or raster_passage(
+def passage_exists(
+    bounds: Bounds, obstacles: Obstacles, goal: Floats, width_m: float, boxes: Boxes | None = None
+) -> bool:
+    """Return whether a disc `width_m` [m] wide can be moved from the origin to `goal` (2,) [m].
+
+    `boxes` has all obstacles in it, several of them in one where they are parts of one thing;
+    None: each is in a box of its own.
+    """
+    return gaps_suffice(bounds, obstacles, goal, width_m, boxes) or raster_passage(
         bounds, obstacles, goal, width_m
     )
 
 
-def gaps_suffice(bounds: Bounds, obstacles: Obstacles, goal: Floats, width_m: float) -> bool:
+def gaps_suffice(
+    bounds: Bounds, obstacles: Obstacles, goal: Floats, width_m: float, boxes: Boxes | None = None
+) -> bool:
     """Return whether every gap is wider than the vehicle; then every free place can be reached.
 
     A rectangle's interior minus finitely many disjoint closed boxes is connected, and that is
-    what remains for the vehicle's centre when no two boxes grown by half its width touch.
+    what remains for the vehicle's centre when no two boxes grown by half its width touch. Arguments
+    as of `passage_exists`.
     """
-    boxes, (low, high) = bounding_boxes(obstacles), inner(bounds, 0.0)
+    boxes = bounding_boxes(obstacles) if boxes is None else boxes
+    low, high = inner(bounds, 0.0)
     return bool(_gaps_suffice(boxes.center, boxes.half, low, high, goal, width_m))
 
 
@@ -90,6 +100,27 @@ def raster_passage(bounds: Bounds, obstacles: Obstacles, goal: Floats, width_m: 
     start = label[-south, -west]
     end = label[round(float(goal[0]) / cell) - south, round(float(goal[1]) / cell) - west]
     return bool(start != 0 and start == end)
+
+
+def free_share(bounds: Bounds, obstacles: Obstacles, count: int) -> float:
+    """Return the share of the floor that none of the first `count` obstacles covers, by a raster.
+
+    Of a pitch of 0.05 m at the finest, and CELLS_MAX cells.
+    """
+    length, width = bounds.north_max - bounds.north_min, bounds.east_max - bounds.east_min
+    cell = max(0.05, math.sqrt(length * width / CELLS_MAX))
+    rows, columns = math.ceil(length / cell), math.ceil(width / cell)
+    north = bounds.north_min + length / rows * (np.arange(rows, dtype=np.float64) + 0.5)
+    east = bounds.east_min + width / columns * (np.arange(columns, dtype=np.float64) + 0.5)
+    free, boxes = np.ones((rows, columns), np.bool_), bounding_boxes(obstacles)
+    for i in range(count):
+        reach = boxes.half[i]
+        window = (
+            _window(north, boxes.center[i, 0], reach[0]),
+            _window(east, boxes.center[i, 1], reach[1]),
+        )
+        free[window] &= _distance(obstacles, i, north[window[0]], east[window[1]]) > 0.0
+    return float(free.mean())
 
 
 def _window(axis: Floats, center: float, reach: float) -> slice:

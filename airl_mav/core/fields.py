@@ -257,15 +257,30 @@ def _dotted(model: type[BaseModel] | None, path: tuple[int | str, ...]) -> str:
 
 
 def _choices(field: FieldInfo) -> dict[str, type[BaseModel]]:
-    """Return the models that a field chooses from by the value of one of theirs; mostly none."""
-    name = field.discriminator
+    """Return the models that a field chooses from by the value of one of theirs; mostly none.
+
+    Those, too, of which it holds several.
+    """
+    name, union = field.discriminator, field.annotation
+    for part in _annotated_parts(field.annotation):
+        for mark in part.__metadata__:
+            if isinstance(mark, FieldInfo) and mark.discriminator is not None:
+                name, union = mark.discriminator, get_args(part)[0]
     if not isinstance(name, str):
         return {}
     return {
         str(value): model
-        for model in get_args(field.annotation)
+        for model in get_args(union)
         for value in get_args(model.model_fields[name].annotation)
     }
+
+
+def _annotated_parts(annotation: Any) -> Iterator[Any]:
+    """Yield what an annotation holds that has marks of its own: Annotated[...]."""
+    if hasattr(annotation, "__metadata__"):
+        yield annotation
+    for inner in get_args(annotation):
+        yield from _annotated_parts(inner)
 
 
 def _accepted(finding: ErrorDetails, model: type[BaseModel] | None) -> str:

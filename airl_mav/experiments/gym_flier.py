@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from airl_mav.arena.geometry import Arena, Shape
+from airl_mav.arena.geometry import Arena
 from airl_mav.core.constants import US_PER_S
 from airl_mav.envs.contact import FLOOR, WALL
 from airl_mav.envs.evaluation import (
@@ -223,5 +223,4 @@ def _name(arena: Arena, touched: int) -> str:
     """Return what was hit, as the plant calls it."""
     if touched in (FLOOR, WALL):
         return "floor" if touched == FLOOR else "wall"
-    moving = "moving" if touched >= arena.n_static else "static"
-    return f"{moving}-{Shape(int(arena.obstacles.shape[touched])).name.lower()}-{touched}"
+    return arena.name_of(touched)

@@ -59,6 +59,9 @@ MATERIALS: dict[str, Material] = {
         albedo=(38, 38, 40), albedo_2=(232, 232, 228), texture="checker", size_m=0.5
     ),
     "orange": Material(albedo=(240, 130, 30)),
+    "bark": Material(albedo=(52, 40, 30), albedo_2=(116, 94, 72), texture="noise", size_m=0.2),
+    "wood": Material(albedo=(120, 84, 48), albedo_2=(168, 126, 80), texture="noise", size_m=0.3),
+    "steel": Material(albedo=(112, 116, 120)),
 }
 """Materials that every arena can name."""
 
@@ -193,7 +196,7 @@ class Appearance(ProfileModel):
 
     @model_validator(mode="after")
     def _materials_are_known(self) -> Appearance:
-        known = [*MATERIALS, WALL_COLOUR, *self.materials]
+        known = self.known_materials
         if WALL_COLOUR in self.materials:
             raise ValueError(f"materials.{WALL_COLOUR}: this name stands for the arena's own field")
         for kind in ("floor", "walls", "static", "moving"):
@@ -201,6 +204,11 @@ class Appearance(ProfileModel):
                 if name not in known:
                     raise ValueError(f"{kind}.materials = {name!r}: accepted: {', '.join(known)}")
         return self
+
+    @property
+    def known_materials(self) -> tuple[str, ...]:
+        """The names of all materials: shipped ones, the walls', the arena's own."""
+        return (*MATERIALS, WALL_COLOUR, *self.materials)
 
     def material(self, name: str, wall_colour: tuple[int, int, int]) -> Material:
         """Return a material by name; one of the arena's own goes before a shipped one."""

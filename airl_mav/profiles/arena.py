@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+import re
+from typing import Annotated, Any, Literal, get_args
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from airl_mav.core.fields import Each, ProfileModel, quantity
 from airl_mav.core.plugins import GENERATORS, part_name
 from airl_mav.profiles.appearance import DEFAULT, Appearance
+from airl_mav.profiles.assets import ASSETS, Asset
 
 ShapeName = Literal["box", "cylinder", "sphere"]
+SHAPES: tuple[str, ...] = get_args(ShapeName)
 OBSTACLES = "obstacles"
 """The generator that is shipped: `arena.generate`."""
 GeneratorName = Annotated[str, part_name(GENERATORS, (OBSTACLES,))]
 Option = bool | int | float | str | list[int | float | str]
+
+_ASSET_NAME = re.compile("[a-z]+(-[a-z]+)*")
+"""What is hit is called after it."""
 
 SPHERE_OFFSET = 0.5
 """A sphere's centre is at most this share of its radius off the flight altitude."""
@@ -79,8 +85,10 @@ class StaticObstacles(ProfileModel):
     count: Annotated[tuple[int, int], Each(0, 200, ascending=True)] = quantity(
         "how many", "1", default=(0, 0)
     )
-    shapes: Annotated[tuple[ShapeName, ...], Field(min_length=1)] = Field(
-        default=("box", "cylinder", "sphere"), description="kinds drawn, with equal odds"
+    shapes: Annotated[tuple[str, ...], Field(min_length=1)] = Field(
+        default=SHAPES,
+        description=f"kinds drawn, with equal odds: {', '.join((*SHAPES, *ASSETS))}, or one of"
+        " assets",
     )
     half_width_m: Annotated[tuple[float, float], Each(0.1, 20, ascending=True)] = quantity(
         "half width of a box (each way), radius of a cylinder or sphere", "m", default=(0.5, 1.5)
@@ -95,6 +103,9 @@ class MovingObstacles(StaticObstacles):
 
     count: Annotated[tuple[int, int], Each(0, 30, ascending=True)] = quantity(
         "how many", "1", default=(0, 0)
+    )
+    shapes: Annotated[tuple[ShapeName, ...], Field(min_length=1)] = Field(
+        default=("box", "cylinder", "sphere"), description="kinds drawn, with equal odds"
     )
     half_width_m: Annotated[tuple[float, float], Each(0.1, 20, ascending=True)] = quantity(
         "half width of a box (each way), radius of a cylinder or sphere", "m", default=(0.4, 0.8)
@@ -161,6 +172,12 @@ class ArenaSpec(ProfileModel):
     moving: MovingObstacles = Field(
         default_factory=MovingObstacles, description="obstacles that move"
     )
+    assets: dict[str, Asset] = Field(
+        default_factory=dict, description="things of your own, made of parts, by name"
+    )
+    asset_scale: Annotated[tuple[float, float], Each(0.1, 10, ascending=True)] = quantity(
+        "factor of all lengths of an asset, drawn for each", "1", default=(1.0, 1.0)
+    )
     appearance: Appearance = Field(
         default_factory=Appearance, description="what a colour camera sees: materials and light"
     )
@@ -173,12 +190,24 @@ class ArenaSpec(ProfileModel):
             del data["generator"], data["options"]
         if self.appearance == DEFAULT:
             del data["appearance"]
+        if not self.assets and self.asset_scale == (1.0, 1.0):
+            del data["assets"], data["asset_scale"]
         return data
+
+    @property
+    def has_assets(self) -> bool:
+        """Whether anything that stands may be made of parts."""
+        return not set(self.static.shapes) <= set(SHAPES)
+
+    def asset(self, name: str) -> Asset | None:
+        """Return what stands under a name of `static.shapes`; None: it is a shape."""
+        return self.assets.get(name) or ASSETS.get(name)
 
     @model_validator(mode="after")
     def _fits_together(self) -> ArenaSpec:
         self._check_start()
         self._check_goal()
+        self._check_assets()
         for name in ("static", "moving"):
             self._check_heights(name, getattr(self, name))
         return self
@@ -211,11 +240,42 @@ class ArenaSpec(ProfileModel):
                     f"start (inside the walls, goal.clearance_m {free:g})"
                 )
 
+    def _check_assets(self) -> None:
+        for name, asset in self.assets.items():
+            if name in SHAPES or _ASSET_NAME.fullmatch(name) is None:
+                raise ValueError(
+                    f"assets.{name}: accepted: a name of small letters, with dashes between words,"
+                    f" but {', '.join(SHAPES)}"
+                )
+            for i, part in enumerate(asset.parts):
+                known_materials = self.appearance.known_materials
+                if part.material is not None and part.material not in known_materials:
+                    raise ValueError(
+                        f"assets.{name}.parts.{i}.material = {part.material!r}: accepted: "
+                        f"{', '.join(known_materials)}"
+                    )
+        for i, name in enumerate(self.static.shapes):
+            if name in SHAPES:
+                continue
+            known = self.asset(name)
+            if known is None:
+                raise ValueError(
+                    f"static.shapes.{i} = {name!r}: accepted: "
+                    f"{', '.join((*SHAPES, *ASSETS, *self.assets))}"
+                )
+            top, wall = self.asset_scale[1] * known.top_m, self.size.height_m
+            if self.static.count[1] > 0 and top > wall:
+                raise ValueError(
+                    f"static.shapes.{i} = {name!r}: reaches up to {top:.3g} m (asset_scale "
+                    f"{list(self.asset_scale)}); accepted: a top <= {wall:g} m (size.height_m, the"
+                    " walls)"
+                )
+
     def _check_heights(self, name: str, kind: StaticObstacles) -> None:
         wall = self.size.height_m
         if kind.count[1] == 0:
             return
-        if kind.height_m[1] > wall and set(kind.shapes) - {"sphere"}:
+        if kind.height_m[1] > wall and {"box", "cylinder"} & set(kind.shapes):
             raise ValueError(
                 f"{name}.height_m = {list(kind.height_m)}: accepted: value <= {wall:g} m "
                 "(size.height_m, the walls)"

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
+from airl_mav.arena.appearance import Statics
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Tour
 from airl_mav.profiles.appearance import DEFAULT, Appearance
 from airl_mav.profiles.projection import Projection
@@ -44,6 +45,14 @@ class TourShown(Message):
     points: tuple[tuple[float, float], ...]
 
 
+class StaticsShown(Message):
+    """What the primitives that stand belong to, as `arena.appearance.Statics`."""
+
+    names: tuple[str, ...]
+    of: tuple[int, ...]
+    materials: tuple[str | None, ...]
+
+
 class ArenaShown(Message):
     """An arena as plain numbers, as `arena.geometry.Arena`."""
 
@@ -58,11 +67,17 @@ class ArenaShown(Message):
     tours: tuple[TourShown, ...]
     goal: tuple[float, float]
     appearance: Appearance = DEFAULT
+    statics: StaticsShown | None = None
 
     @classmethod
     def of(cls, arena: Arena) -> ArenaShown:
         """Return an arena as plain numbers."""
         obstacles, (north, east) = arena.obstacles, arena.goal.tolist()
+        statics = None
+        if (known := arena.statics) is not None:
+            statics = StaticsShown(
+                names=known.names, of=tuple(known.of.tolist()), materials=known.materials
+            )
         return cls(
             name=arena.name,
             seed=arena.seed,
@@ -78,11 +93,12 @@ class ArenaShown(Message):
             ),
             goal=(north, east),
             appearance=arena.appearance,
+            statics=statics,
         )
 
     def arena(self) -> Arena:
         """Return the arena."""
-        n = len(self.shape)
+        n, known = len(self.shape), self.statics
         return Arena(
             name=self.name,
             seed=self.seed,
@@ -97,6 +113,9 @@ class ArenaShown(Message):
             tours=tuple(Tour(np.array(t.times_s), np.array(t.points)) for t in self.tours),
             goal=np.array(self.goal),
             appearance=self.appearance,
+            statics=None
+            if known is None
+            else Statics(known.names, np.array(known.of, np.int64), known.materials),
         )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple, Protocol
 
-from airl_mav.arena.geometry import Arena, Shape
+from airl_mav.arena.geometry import Arena
 from airl_mav.core.frames import Vector
 from airl_mav.vehicle.rotation import Quat, Vec
 
@@ -77,12 +77,6 @@ class Body(Protocol):
     def close(self) -> None:
         """Release what it holds."""
         ...
-
-
-def obstacle_name(arena: Arena, i: int) -> str:
-    """Return what obstacle i of an arena is called in a collision event."""
-    kind = Shape(int(arena.obstacles.shape[i])).name.lower()
-    return f"{'moving' if i >= arena.n_static else 'static'}-{kind}-{i}"
 
 
 def walls_of(arena: Arena) -> list[tuple[str, Vec, Vec]]:

@@ -16,7 +16,7 @@ from airl_mav.profiles.vehicle import Body as BodyProfile
 from airl_mav.vehicle.airframe import Airframe, airframe_of
 from airl_mav.vehicle.rigid_body import accelerate, drift
 from airl_mav.vehicle.rotation import Quat, Vec, conjugate, rotate
-from firmware_sim.plant.body import FLOOR, NOTHING, Touch, obstacle_name, walls_of
+from firmware_sim.plant.body import FLOOR, NOTHING, Touch, walls_of
 from firmware_sim.plant.contacts.box import BREAKING_SHARE, MOST, ROW
 from firmware_sim.plant.contacts.convex import touch_obstacle
 from firmware_sim.plant.contacts.floor import FLOOR_ID, KEPT, touch_floor
@@ -76,7 +76,7 @@ def solids_of(arena: Arena | None) -> tuple[Solids, list[str]]:
         points,
         np.zeros(len(arena.tours), np.int64),
     )
-    return solids, [name for name, _, _ in walls] + [obstacle_name(arena, i) for i in range(len(o))]
+    return solids, [name for name, _, _ in walls] + [arena.name_of(i) for i in range(len(o))]
 
 
 def _greatest_speed(solids: Solids) -> float:

@@ -15,7 +15,7 @@ from airl_mav.core.frames import (
     quat_ned_frd_to_enu_flu,
     quat_wxyz_to_xyzw,
 )
-from firmware_sim.plant.body import FLOOR, obstacle_name, walls_of
+from firmware_sim.plant.body import FLOOR, walls_of
 from firmware_sim.plant.bullet import NO_CLIENT, connect, number_of, pybullet
 from firmware_sim.plant.movers import Movers, Xyzw
 
@@ -107,5 +107,5 @@ class World:
             else:
                 shape = self.client.createCollisionShape(pybullet.GEOM_SPHERE, radius=x)
             attitudes.append(facing(float(o.yaw[i])))
-            bodies.append(self._add(shape, o.center[i], attitudes[i], obstacle_name(arena, i)))
+            bodies.append(self._add(shape, o.center[i], attitudes[i], arena.name_of(i)))
         return bodies, attitudes

@@ -35,11 +35,19 @@ def test_both_plants_fly_the_same_flight(arena: str, seed: int) -> None:
 
 
 @compared_with_pybullet
-def test_a_collision_is_the_same_on_both_plants() -> None:
-    """A policy that knows no obstacles, among many."""
-    one, other = (
-        flown("dense-obstacles", "no-obstacles", 1, plant) for plant in get_args(PlantName)
-    )
+@pytest.mark.parametrize(
+    ("arena", "policy", "seed", "hit"),
+    [
+        # A policy that knows no obstacles, among many; and one into a wire of 2 cm.
+        ("dense-obstacles", "no-obstacles", 1, "hit static-"),
+        ("park", "static-obstacles-fast", 12, "hit static-wire-"),
+    ],
+)
+def test_a_collision_is_the_same_on_both_plants(
+    arena: str, policy: str, seed: int, hit: str
+) -> None:
+    one, other = (flown(arena, policy, seed, plant) for plant in get_args(PlantName))
+    assert one.record.reason.startswith(hit)
     assert one.record.outcome is other.record.outcome is Outcome.COLLISION
     assert one.record.reason == other.record.reason
     assert one.record.ended_us == other.record.ended_us

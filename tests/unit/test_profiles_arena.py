@@ -14,7 +14,7 @@ from airl_mav.core.fields import range_of, unit_of
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 
-NO_NUMBERS = ("description", "shapes", "generator", "options", "materials")
+NO_NUMBERS = ("description", "shapes", "generator", "options", "materials", "assets")
 
 
 def load(text: str, folder: Path) -> ArenaSpec:
@@ -93,7 +93,7 @@ def test_every_number_has_meaning_unit_and_range() -> None:
         ),
         (
             "[static]\nshapes = ['cone']",
-            "static.shapes.0 = 'cone': accepted: 'box'",
+            "static.shapes.0 = 'cone': accepted: box, cylinder, sphere, tree",
         ),
         ("[static]\nshapes = []", "static.shapes = []: accepted: "),
         (

@@ -31,7 +31,7 @@ LOOK_BACK = 5
 SEEN_SHARE = 0.002
 """An obstacle on a smaller part of the picture counts as not seen: 6 pixels of 64 x 48."""
 
-_THING = re.compile(r"hit (?:[a-z]+-)*([a-z]+(?:[- ](\d+))?)")
+_THING = re.compile(r"hit (?:(?:static|moving)-)?([a-z]+(?:-[a-z]+)*(?:[- ](\d+))?)")
 
 
 @dataclass(frozen=True)
