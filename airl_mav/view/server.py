@@ -81,8 +81,7 @@ class View:
             self._panel.draw(self._shown)
         if self._drawn % STRIP_EVERY == 0:
             self._panel.draw_strip(self._shown)
-        if self._shown.vehicle is not None:
-            self._watchers.follow(self._shown.vehicle.position)
+        self._watchers.follow(self._shown)
 
 
 def main() -> int:

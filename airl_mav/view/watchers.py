@@ -2,17 +2,30 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import viser
+from numpy.typing import NDArray
+
+from airl_mav.view.shown import Shown
+from airl_mav.view.sight import unhidden
+
+Floats = NDArray[np.float64]
 
 CHASE = np.array([-5.0, 0.0, -3.2])
 """Where a watcher's camera begins, from the vehicle, NED [m]."""
 
 SLIM = 1.5
 """A page so much higher than wide is a phone's, where the panel covers the lower half."""
+
+UNMOVED_M = 0.02
+"""A page tells where its camera is with rounding: nobody has moved it by less."""
+
+REMEMBERED = 60
+"""Places that a page may still tell of: those of two seconds."""
 
 BELOW = np.array([0.0, 0.0, 2.2])
 """There the camera looks so far below the vehicle, NED [m]."""
@@ -29,8 +42,10 @@ class Watchers:
         self._deserted = deserted
         self._following: dict[int, Any] = {}
         """The switch of each."""
-        self._placed: set[int] = set()
-        """Those whose camera has been put behind the vehicle."""
+        self._asked: dict[int, Floats] = {}
+        """Where each wants the camera, from the vehicle NED [m]."""
+        self._put: dict[int, deque[Floats]] = {}
+        """Where it was put lately; a page may tell of it a little later."""
         server.on_client_connect(self._welcome)
         server.on_client_disconnect(self._part)
 
@@ -39,23 +54,34 @@ class Watchers:
         """Whether anybody watches."""
         return bool(self._server.get_clients())
 
-    def follow(self, position: tuple[float, float, float]) -> None:
-        """Move the cameras that follow along; the vehicle is at `position` NED [m]."""
-        at = np.array(position)
+    def follow(self, shown: Shown) -> None:
+        """Move the cameras that follow along with the vehicle, in front of what would hide it."""
+        vehicle, episode, arena = shown.vehicle, shown.episode, shown.arena
+        if vehicle is None or episode is None:
+            return
+        at = np.array(vehicle.position)
         for number, client in self._server.get_clients().items():
             switch, camera = self._following.get(number), client.camera
             if switch is None or not switch.value:
                 continue
-            # As each has turned and zoomed it since.
-            offset = camera.position - camera.look_at
-            if number not in self._placed:
-                self._placed.add(number)
-                offset = CHASE
             slim = camera.image_height > SLIM * camera.image_width
             aim = at + BELOW if slim else at
+            asked = self._asked_by(number, camera.position - camera.look_at)
+            offset = asked
+            if arena is not None:
+                offset = unhidden(arena, vehicle.time_us - episode.started_us, at, asked)
+            self._put[number].append(offset)
             with client.atomic():
                 camera.position = aim + offset
                 camera.look_at = aim
+
+    def _asked_by(self, number: int, found: Floats) -> Floats:
+        """Return where a watcher wants the camera, which was `found` there, from the vehicle."""
+        if number not in self._asked:
+            self._asked[number], self._put[number] = CHASE, deque(maxlen=REMEMBERED)
+        elif not any(np.allclose(found, put, atol=UNMOVED_M) for put in self._put[number]):
+            self._asked[number] = found  # The watcher has turned or zoomed it.
+        return self._asked[number]
 
     def _welcome(self, client: viser.ClientHandle) -> None:
         switch = client.gui.add_checkbox("Follow the vehicle", True, order=-1.0)
@@ -63,6 +89,7 @@ class Watchers:
 
     def _part(self, client: viser.ClientHandle) -> None:
         self._following.pop(client.client_id, None)
-        self._placed.discard(client.client_id)
+        self._asked.pop(client.client_id, None)
+        self._put.pop(client.client_id, None)
         if not self.there:
             self._deserted()

@@ -156,8 +156,7 @@ class ReplayPage:
             self._playing = self._seconds < self._flight.duration_s
         if self._dirty:
             self.draw(panel=not self._playing or self._drawn % PANEL_EVERY == 0)
-        if self._shown.vehicle is not None:
-            self._watchers.follow(self._shown.vehicle.position)
+        self._watchers.follow(self._shown)
 
     def draw(self, *, panel: bool = True) -> None:
         """Draw the present moment; the panel only where `panel` says so."""
