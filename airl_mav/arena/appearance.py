@@ -182,7 +182,9 @@ def _light(appearance: Appearance, draw: int) -> Light:
     )
     sun_irradiance = rng.uniform(*sun.irradiance)
     sky_irradiance = stream(draw, Stream.APPEARANCE, _Part.SKY).uniform(*sky.irradiance)
-    extinction = stream(draw, Stream.APPEARANCE, _Part.FOG).uniform(*appearance.fog.extinction_1_m)
+    rng = stream(draw, Stream.APPEARANCE, _Part.FOG)
+    extinction = rng.uniform(*appearance.fog.extinction_1_m)
+    extinction = extinction if rng.random() < appearance.fog.share else 0.0
     level = math.cos(elevation)
     to_sun = (level * math.cos(azimuth), level * math.sin(azimuth), -math.sin(elevation))
     zenith, horizon = (linear_of(np.array(c) / 255.0) for c in (sky.zenith, sky.horizon))

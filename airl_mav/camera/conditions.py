@@ -50,7 +50,7 @@ def check_renderer(camera: Camera, renderer: Renderer, arena: ArenaSpec) -> None
         accepted = "raycast with a depth camera; mitsuba draws colour"
     elif camera.projection != "pinhole":
         accepted = f"raycast with a {camera.projection} camera"
-    elif max(arena.appearance.fog.extinction_1_m) > 0.0:
+    elif arena.appearance.fog.drawn:
         accepted = "raycast in an arena with fog"
     elif find_spec("mitsuba") is None:
         accepted = "raycast: mitsuba is not installed (pip install 'airl-mav[render]')"

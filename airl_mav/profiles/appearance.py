@@ -170,6 +170,18 @@ class Fog(ProfileModel):
         "1/m",
         default=(0.0, 0.0),
     )
+    share: float = quantity(
+        "share of the drawn appearances that have fog at all; the air of the others is clear",
+        "1",
+        ge=0,
+        le=1,
+        default=1.0,
+    )
+
+    @property
+    def drawn(self) -> bool:
+        """Whether any seed may have fog."""
+        return self.share > 0.0 and self.extinction_1_m[1] > 0.0
 
 
 class Appearance(ProfileModel):

@@ -143,9 +143,16 @@ def _name_power_model(data: dict[str, Any], path: Path) -> None:
         )
 
 
+_WHICH = ("model", "name")
+"""The fields of a table that say which: of another model or algorithm, the fields are others."""
+
+
 def _overlaid(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
-    """Return one table put over another, table by table; one of another `model` replaces it."""
-    if above.get("model", below.get("model")) != below.get("model"):
+    """Return one table put over another, table by table.
+
+    A table that is of another `model`, or has another `name`, replaces that of the base.
+    """
+    if any(above.get(which, below.get(which)) != below.get(which) for which in _WHICH):
         return above
     merged = dict(below)
     for key, value in above.items():

@@ -32,7 +32,13 @@ from airl_mav.policy.card import PolicyCard, PolicyFacts, Training
 from airl_mav.rehearsal.lock import locked
 from airl_mav.training.algorithms import make_model
 from airl_mav.training.checkpoint import load_latest, save_checkpoint
-from airl_mav.training.config import SELECTION_SEED, TrainingConfig, check_actions, kind_of
+from airl_mav.training.config import (
+    SELECTION_SEED,
+    TrainingConfig,
+    check_actions,
+    check_fields,
+    kind_of,
+)
 from airl_mav.training.export import export_sb3
 from airl_mav.training.initial import begin_with
 from airl_mav.training.recurrent import GreedyDecisions
@@ -92,6 +98,7 @@ def train(
             process trains in it, or the network cannot be exported.
         KeyboardInterrupt: Ctrl-C; the newest checkpoint stays, and `resume` continues from it.
     """
+    check_fields(config.algorithm)  # before there is a folder
     config = config.model_copy(update={"environment": bounded(config.environment)})
     progress = progress or TrainingProgress()
     with locked(out, progress.waiting):

@@ -23,7 +23,7 @@ from airl_mav.policy.observation_spec import Encoded
 from airl_mav.profiles.loading import list_profiles, load_profile
 from airl_mav.rehearsal import lock
 from airl_mav.training import run
-from airl_mav.training.config import TrainingConfig
+from airl_mav.training.config import TrainingConfig, check_fields
 from airl_mav.training.run import nominal
 from airl_mav.training.store import TrainingFolder
 from tests.support.command_line import airl
@@ -88,6 +88,7 @@ def straight(short: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_shipped_configurations_are_sound(name: str) -> None:
     config = load_profile("training", name, TrainingConfig)
     assert config.selection.every <= config.steps
+    check_fields(config.algorithm)
 
 
 @pytest.mark.nightly

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.integrate import quad
 
 from airl_mav.arena.appearance import FLOOR, OBSTACLE, TEXTURES, WALLS, linear_of, srgb_of
@@ -92,6 +93,22 @@ def test_a_knob_and_the_number_of_obstacles_leave_the_other_draws_alone() -> Non
     np.testing.assert_array_equal(few.light.to_sun, changed.light.to_sun)
     np.testing.assert_array_equal(few.light.zenith, changed.light.zenith)
     assert few.light.extinction != changed.light.extinction
+
+
+def test_a_share_of_the_looks_has_fog_and_that_of_the_same_density() -> None:
+    spec = shipped("static-obstacles")
+
+    def extinctions(share: float) -> NDArray[np.float64]:
+        fog = {"extinction_1_m": [0.02, 0.1], "share": share}
+        foggy = with_look(spec, **{**RICH, "fog": fog})
+        return np.array([make(foggy, 4 * seed).look.light.extinction for seed in range(200)])
+
+    always, half = extinctions(1.0), extinctions(0.5)
+    assert always.min() > 0.0
+    np.testing.assert_array_equal(half[half > 0.0], always[half > 0.0])
+    # 200 draws of one half: 100 of them give or take 3.3 standard deviations.
+    assert 76 < np.count_nonzero(half) < 124
+    assert not extinctions(0.0).any()
 
 
 def test_draws_are_within_their_bounds_and_use_them() -> None:
