@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from pydantic import BaseModel, Field
 
+from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.profiles.loading import load_profile
 
 if TYPE_CHECKING:
@@ -78,9 +79,14 @@ class TrainRequest(BaseModel):
     def configured(self) -> TrainingConfig:
         """Return the configuration with what was given put into it. Raises UsageError."""
         # Imported here: it takes what the extras install, and they are looked for first.
-        from airl_mav.training.config import TrainingConfig, configured
+        from airl_mav.training.config import TrainingConfig, check_fields, configured
 
+        loaded = load_profile("training", self.config, TrainingConfig)
+        try:
+            check_fields(loaded.algorithm)
+        except FieldError as error:  # It is the file's, not an option's.
+            raise UsageError(f"{self.config}: {error.line()}") from None
         # Not what a command adds to it.
         asked = TrainRequest.model_fields.keys() - {"config", "out", "name", "resume"}
         changes = self.model_dump(include=asked)
-        return configured(load_profile("training", self.config, TrainingConfig), **changes)
+        return configured(loaded, **changes)

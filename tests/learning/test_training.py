@@ -24,6 +24,7 @@ from airl_mav.profiles.loading import list_profiles, load_profile
 from airl_mav.rehearsal import lock
 from airl_mav.training import run
 from airl_mav.training.config import TrainingConfig, check_fields
+from airl_mav.training.request import TrainRequest
 from airl_mav.training.run import nominal
 from airl_mav.training.store import TrainingFolder
 from tests.support.command_line import airl
@@ -89,6 +90,20 @@ def test_shipped_configurations_are_sound(name: str) -> None:
     config = load_profile("training", name, TrainingConfig)
     assert config.selection.every <= config.steps
     check_fields(config.algorithm)
+
+
+def test_a_file_s_field_that_the_algorithm_lacks_is_the_file_s(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text('base = "static-obstacles-dagger"\n[algorithm]\ngamma = 0.9\n')
+    with pytest.raises(UsageError, match="mine.toml: algorithm.gamma: 'dagger' has no such field"):
+        TrainRequest(config=str(path)).configured()
+
+
+def test_of_another_algorithm_than_its_base_s_nothing_is_left(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text('base = "static-obstacles-dagger"\n[algorithm]\nname = "ppo"\ngamma = 0.9\n')
+    algorithm = TrainRequest(config=str(path)).configured().algorithm
+    assert algorithm.model_fields_set == {"name", "gamma"}
 
 
 @pytest.mark.nightly
