@@ -17,6 +17,7 @@ SHIPPED: dict[str, tuple[str, str]] = {
     "static-obstacles-fast": ("static-obstacles-fast", "run"),
     "static-obstacles-any-latency": ("any-latency", "static-obstacles-any-latency-1ms"),
     "static-obstacles-d435": ("static-obstacles-d435", "run"),
+    "static-obstacles-rgb-fast": ("static-obstacles-rgb-fast", "run"),
     "static-obstacles-ras-pi-4": ("gap", "static-obstacles-mitigated"),
     "no-obstacles": ("generalisation", "no-obstacles-no-obstacles"),
     "dynamic-obstacles": ("generalisation", "dynamic-obstacles-dynamic-obstacles"),
