@@ -78,7 +78,8 @@ class Watchers:
     def _asked_by(self, number: int, found: Floats) -> Floats:
         """Return where a watcher wants the camera, which was `found` there, from the vehicle."""
         if number not in self._asked:
-            self._asked[number], self._put[number] = CHASE, deque(maxlen=REMEMBERED)
+            # The page may tell once more of where its camera was before it is put anywhere.
+            self._asked[number], self._put[number] = CHASE, deque([found], maxlen=REMEMBERED)
         elif not any(np.allclose(found, put, atol=UNMOVED_M) for put in self._put[number]):
             self._asked[number] = found  # The watcher has turned or zoomed it.
         return self._asked[number]

@@ -127,6 +127,15 @@ def test_the_camera_goes_back_to_its_place_once_nothing_hides_the_vehicle(watche
     np.testing.assert_allclose(page.offset, CHASE)
 
 
+def test_a_page_may_tell_late_of_where_its_camera_was_at_first(watched: Any) -> None:
+    watchers, page = watched
+    first = page.offset
+    watchers.follow(shown(0.0))
+    page.camera.position = page.camera.look_at + first
+    watchers.follow(shown(0.5))
+    np.testing.assert_allclose(page.offset, CHASE)
+
+
 def test_who_turns_the_camera_finds_it_turned(watched: Any) -> None:
     watchers, page = watched
     watchers.follow(shown(0.0))
