@@ -13,7 +13,7 @@ from airl_mav.profiles.appearance import DEFAULT, Appearance
 from airl_mav.profiles.assets import ASSETS, Asset
 
 ShapeName = Literal["box", "cylinder", "sphere"]
-SHAPES: tuple[str, ...] = get_args(ShapeName)
+SHAPES: tuple[ShapeName, ...] = get_args(ShapeName)
 OBSTACLES = "obstacles"
 """The generator that is shipped: `arena.generate`."""
 GeneratorName = Annotated[str, part_name(GENERATORS, (OBSTACLES,))]
@@ -105,7 +105,7 @@ class MovingObstacles(StaticObstacles):
         "how many", "1", default=(0, 0)
     )
     shapes: Annotated[tuple[ShapeName, ...], Field(min_length=1)] = Field(
-        default=("box", "cylinder", "sphere"), description="kinds drawn, with equal odds"
+        default=SHAPES, description="kinds drawn, with equal odds"
     )
     half_width_m: Annotated[tuple[float, float], Each(0.1, 20, ascending=True)] = quantity(
         "half width of a box (each way), radius of a cylinder or sphere", "m", default=(0.4, 0.8)

@@ -11,7 +11,7 @@ import pybullet
 import pytest
 from scipy.spatial.transform import Rotation
 
-from airl_mav.arena.appearance import OBSTACLE, TEXTURES, linear_of
+from airl_mav.arena.appearance import OBSTACLE, TEXTURES, Statics, linear_of
 from airl_mav.arena.footprints import Boxes, bounding_boxes
 from airl_mav.arena.generate import free_area_fraction, generate
 from airl_mav.arena.geometry import Arena, Shape
@@ -84,10 +84,23 @@ def touched(arena: Arena, place: tuple[float, float, float], radius_m: float) ->
     )
 
 
+def statics_of(arena: Arena) -> Statics:
+    assert arena.statics is not None
+    return arena.statics
+
+
 def things_of(arena: Arena) -> list[np.ndarray]:
     """Return the numbers of the primitives of each thing."""
-    assert arena.statics is not None
-    return [np.flatnonzero(arena.statics.of == k) for k in range(len(arena.statics.names))]
+    statics = statics_of(arena)
+    return [np.flatnonzero(statics.of == k) for k in range(len(statics.names))]
+
+
+def half_sizes(arena: Arena, name: str) -> list[list[float]]:
+    """Return the half sizes of all parts of the things of a name, sorted."""
+    statics, sizes = statics_of(arena), arena.obstacles.half_size.tolist()
+    return sorted(
+        size for part, size in enumerate(sizes[: arena.n_static]) if statics.name_of(part) == name
+    )
 
 
 def test_the_parts_keep_their_places_in_the_thing(tmp_path: Path) -> None:
@@ -113,7 +126,7 @@ def test_kinds_sizes_and_headings_are_drawn() -> None:
     trunks = [
         float(arena.obstacles.half_size[parts[0], 0]) / 0.14
         for arena in arenas
-        for parts, name in zip(things_of(arena), arena.statics.names, strict=True)  # type: ignore[union-attr]
+        for parts, name in zip(things_of(arena), statics_of(arena).names, strict=True)
         if name == "tree"
     ]
     assert min(trunks) < 0.6
@@ -128,21 +141,10 @@ def test_the_same_seed_is_the_same_and_what_one_thing_is_changes_no_other() -> N
     other = [{"tree": "chair"}.get(name, name) for name in shapes]
     static = load_profile("arenas", "park", ArenaSpec).static.model_dump()
     changed = park(3, static={**static, "shapes": other})
-    kept = {
-        name: [
-            again.obstacles.half_size[part].tolist()
-            for part, thing in enumerate(again.statics.of)  # type: ignore[union-attr]
-            if again.statics.names[thing] == name  # type: ignore[union-attr]
-        ]
-        for name in set(again.statics.names) - {"tree"}  # type: ignore[union-attr]
-    }
-    for name, sizes in kept.items():
-        found = [
-            changed.obstacles.half_size[part].tolist()
-            for part, thing in enumerate(changed.statics.of)  # type: ignore[union-attr]
-            if changed.statics.names[thing] == name  # type: ignore[union-attr]
-        ]
-        assert sorted(found) == sorted(sizes)
+    kept = set(statics_of(again).names) - {"tree"}
+    assert kept
+    for name in kept:
+        assert half_sizes(changed, name) == half_sizes(again, name)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
