@@ -52,6 +52,9 @@ TEXT_CHARACTERS = 50
 ARM_RETRY_S = 0.5
 """Time between two requests to arm [s]."""
 
+ORIGIN_RETRY_S = 2.0
+"""Time between two messages that tell the origin [s]."""
+
 STREAM_TIMEOUT_S = 10.0
 """Longest time until a flight controller that still boots grants its streams [wall s]."""
 
@@ -251,19 +254,31 @@ class MavsdkLink:
         """
         self._telemetry.subscribe_status_text(lambda status, _: heard(status.text))
 
-    def arm(self, timeout_s: float, stop: threading.Event) -> None:
+    def arm(
+        self,
+        timeout_s: float,
+        stop: threading.Event,
+        origin: tuple[float, float, float] | None = None,
+    ) -> None:
         """Wait until the flight controller reports good health, then arm.
 
         Health is reported a few times a second, so right after a reboot the last report may be out
         of date: it must have been good for a while, and a refused request is repeated. `stop`, set
-        from outside, ends the wait.
+        from outside, ends the wait. A flight controller that does not know its place is told its
+        origin, if that is given: latitude, longitude [deg], altitude [m].
         """
         deadline_us = self._deadline(timeout_s)
-        good_since_us = self._clock.time_us()
+        good_since_us, tell_us = self._clock.time_us(), self._clock.time_us()
         while self._clock.time_us() < good_since_us + int(HEALTH_SETTLE_S * US_PER_S):
             self._check(deadline_us, f"not healthy after {timeout_s:g} s: it refuses to arm", stop)
             self._pause()
-            if not self.healthy:
+            missing = set(self.missing_health())
+            if origin is not None:
+                # MAVSDK's flag is that of a GPS fix; who may be armed in Hold knows its place.
+                missing.discard("global position")
+                if "armable" in missing and "local position" not in missing:
+                    tell_us = self._tell_origin(origin, tell_us)
+            if missing:
                 good_since_us = self._clock.time_us()
         while True:
             try:
@@ -272,6 +287,14 @@ class MavsdkLink:
             except ActionError as error:
                 self._check(deadline_us, f"arming failed: {_reason(error)}", stop)
                 self._pause(ARM_RETRY_S)
+
+    def _tell_origin(self, origin: tuple[float, float, float], due_us: int) -> int:
+        """Tell the origin if it is time to; return when it is time again. None is acknowledged."""
+        now_us = self._clock.time_us()
+        if now_us < due_us:
+            return due_us
+        self._call("origin", lambda: self._action.set_gps_global_origin(*origin))
+        return now_us + int(ORIGIN_RETRY_S * US_PER_S)
 
     def takeoff(self, altitude_m: float, timeout_s: float, stop: threading.Event) -> None:
         """Take off and return when the altitude above the start is reached.

@@ -101,7 +101,7 @@ def fly_mission(
         decided=decided,
     )
     try:
-        _begin(link, start, pilot_settings.altitude_m, stop, progress)
+        _begin(link, start, pilot_settings, stop, progress)
         progress("navigating")
         watchdog.begin()
         guard.start(watchdog)
@@ -158,7 +158,7 @@ def fly_mission(
 def _begin(
     link: MavsdkLink,
     start: Start,
-    altitude_m: float,
+    settings: PilotSettings,
     stop: threading.Event,
     progress: Callable[[str], None],
 ) -> None:
@@ -168,9 +168,9 @@ def _begin(
     if start == "offboard":
         link.await_offboard(stop)
         return
-    link.arm(link.dialect.arm_timeout_s, stop)
+    link.arm(link.dialect.arm_timeout_s, stop, settings.origin)
     progress("taking off")
-    link.takeoff(altitude_m, TAKEOFF_TIMEOUT_S, stop)
+    link.takeoff(settings.altitude_m, TAKEOFF_TIMEOUT_S, stop)
     link.enter_offboard()
 
 

@@ -1,6 +1,8 @@
-"""The sensors of a vehicle profile, but its camera: inertial, magnetic, pressure, GPS."""
+"""The sensors of a vehicle profile, but its camera: inertial, magnetic, pressure, GPS, vision."""
 
 from __future__ import annotations
+
+from pydantic import Field
 
 from airl_mav.core.fields import ProfileModel, quantity
 
@@ -34,12 +36,31 @@ class Barometer(ProfileModel):
 class Gps(ProfileModel):
     """GPS receiver."""
 
+    fitted: bool = Field(default=True, description="whether the vehicle has one")
     rate_hz: float = quantity("fixes a second", "Hz", ge=1, le=25)
     horizontal_noise_m: float = quantity("white noise, sd", "m", ge=0, le=10)
     vertical_noise_m: float = quantity("white noise, sd", "m", ge=0, le=20)
     velocity_noise_m_s: float = quantity("white noise, sd per axis", "m/s", ge=0, le=2)
     drift_m_sqrt_s: float = quantity("position drift random walk", "m/sqrt(s)", ge=0, le=1)
     drift_time_constant_s: float = quantity("the drift decays with", "s", gt=1, le=10_000)
+
+
+class Vision(ProfileModel):
+    """Visual-inertial odometry, or a motion capture system: the pose in a frame of its own.
+
+    The frame is the vehicle's at the start. What drifts does so with the way and with time, for
+    good: nothing is seen a second time.
+    """
+
+    rate_hz: float = quantity("poses a second", "Hz", ge=5, le=250)
+    delay_s: float = quantity("from a pose until it is told", "s", ge=0, le=0.3)
+    position_noise_m: float = quantity("white noise, sd per axis", "m", ge=0, le=1)
+    velocity_noise_m_s: float = quantity("white noise, sd per axis", "m/s", ge=0, le=2)
+    angle_noise_rad: float = quantity("white noise, sd per axis", "rad", ge=0, le=0.5)
+    position_drift_m_sqrt_m: float = quantity(
+        "position drift random walk, by the way flown, sd per axis", "m/sqrt(m)", ge=0, le=1
+    )
+    yaw_drift_rad_sqrt_s: float = quantity("heading drift random walk", "rad/sqrt(s)", ge=0, le=0.1)
 
 
 class Sensors(ProfileModel):
@@ -49,3 +70,6 @@ class Sensors(ProfileModel):
     magnetometer: Magnetometer
     barometer: Barometer
     gps: Gps
+    vision: Vision | None = Field(
+        default=None, description="what tells the flight controller its pose; absent = nothing does"
+    )

@@ -289,6 +289,11 @@ class VehicleProfile(ProfileModel):
         return self.response is not None and self.camera.kind == "depth"
 
     @property
+    def uses_gps(self) -> bool:
+        """Whether its flight controller knows by GPS where on the globe it is."""
+        return self.sensors.gps.fitted and self.parameters.get("EKF2_GPS_CTRL", 1) != 0
+
+    @property
     def thrust_n(self) -> float:
         """Greatest thrust of all rotors [N]: more than the weight, by `THRUST_MARGIN`."""
         return len(CORNERS) * self.rotor.thrust_max_n

@@ -16,6 +16,13 @@ from airl_mav.flight.judge import TIME_LIMIT_S, GoalRadius, TimeLimit
 from airl_mav.policy.actions import DecisionTiming
 from airl_mav.scenario.aircraft import FREE, NO_TWIN, Aircraft
 
+Place = tuple[
+    Annotated[float, Field(ge=-90.0, le=90.0)],
+    Annotated[float, Field(ge=-180.0, le=180.0)],
+    Annotated[float, Field(gt=-12_000.0, lt=100_000.0)],
+]
+"""Latitude, longitude [deg], altitude above mean sea level [m]; what PX4 takes for an origin."""
+
 ArenaName = Annotated[str, Field(description="arena profile: a shipped name, or a path to a .toml")]
 PolicyName = Annotated[
     str,
@@ -134,6 +141,8 @@ class PilotSettings:
     """When a decision begins: after the hold of the one before, or as soon as that is ready."""
     compensate: bool = False
     """Whether what is seen is carried forward to when the decision will act."""
+    origin: tuple[float, float, float] | None = None
+    """Where the flight begins: latitude, longitude [deg], altitude [m]; None = GPS tells it."""
 
 
 class Inference(ProfileModel):
@@ -200,6 +209,13 @@ class Decisions(Inference):
         description="compensate the latency: state and depth image are carried forward to when the"
         " decision is expected to act, by the vehicle's response to the setpoints in flight; by"
         " default as the policy's card says, or not",
+    )
+    origin: Annotated[Place | None, NO_TWIN] = Field(
+        default=None,
+        description="where on the globe the flight begins: latitude, longitude (degrees), altitude"
+        " above mean sea level (m). A flight controller without GPS is told it before it is armed,"
+        " as it flies Hold only where it knows its place; by default, in a rehearsal without GPS,"
+        " the place of all rehearsals",
     )
     watchdog: WatchdogSettings = Field(
         default_factory=WatchdogSettings, description="bounds on silence"

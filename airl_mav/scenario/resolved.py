@@ -13,6 +13,7 @@ from pydantic import BaseModel
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.constants import Level
+from airl_mav.core.location import HOME
 from airl_mav.flight.judge import Task
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.setup import BUILT_IN, Part, Setup
@@ -135,8 +136,18 @@ class ResolvedScenario:
 
     @property
     def companion_pilot(self) -> PilotSettings:
-        """How the companion flies the policy: closer to the goal than the referee asks for."""
-        return replace(self.pilot, goal_radius_m=ARRIVAL_SHARE * self.pilot.goal_radius_m)
+        """How the companion flies the policy: closer to the goal than the referee asks for.
+
+        A vehicle without GPS is told where it is: here that is known.
+        """
+        origin = self.pilot.origin
+        if origin is None and not self.vehicle.uses_gps:
+            origin = HOME.latitude_deg, HOME.longitude_deg, HOME.altitude_m
+        return replace(
+            self.pilot,
+            goal_radius_m=ARRIVAL_SHARE * self.pilot.goal_radius_m,
+            origin=origin,
+        )
 
     @property
     def takeoff_s(self) -> float:
