@@ -9,9 +9,21 @@ hundred times real time.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
+
+import numpy as np
 
 from airl_mav.core.frames import Geodetic, Vector
+
+UNKNOWN_VARIANCE = np.full(3, np.nan)
+UNKNOWN_VARIANCE.setflags(write=False)
+
+PoseFrame = Literal["ned", "frd"]
+"""What a pose is measured in: north, east, down; or forward, right, down as it was at first, with a
+heading that nobody knows."""
+
+VelocityFrame = Literal["ned", "frd", "body"]
+"""What a velocity is measured in: as a pose, or in the vehicle's own axes FRD."""
 
 
 class GpsFix(NamedTuple):
@@ -26,6 +38,27 @@ class GpsFix(NamedTuple):
     satellites: int
     fix_type: int = 3
     """GPS_FIX_TYPE: 3 = 3-D fix."""
+
+
+class Odometry(NamedTuple):
+    """One pose that something other than the flight controller has estimated: vision, mocap.
+
+    The fields are those of PX4's vehicle_odometry. What is None is not measured; a variance that is
+    not finite is not known.
+    """
+
+    position: Vector | None = None  # (3,) in the pose's frame [m]
+    velocity: Vector | None = None  # (3,) in the velocity's frame [m/s]
+    quaternion: Vector | None = None  # (4,) body FRD -> the pose's frame, of length 1
+    pose_frame: PoseFrame = "ned"
+    velocity_frame: VelocityFrame = "ned"
+    position_variance: Vector = UNKNOWN_VARIANCE  # (3,) [m²]
+    velocity_variance: Vector = UNKNOWN_VARIANCE  # (3,) [m²/s²]
+    orientation_variance: Vector = UNKNOWN_VARIANCE  # (3,) roll, pitch, yaw [rad²]
+    reset_counter: int = 0
+    """Another number than before: what was measured has jumped."""
+    quality: int = 0
+    """Percent; 0 = not told."""
 
 
 class BatterySample(NamedTuple):
@@ -53,6 +86,8 @@ class SensorSample(NamedTuple):
     esc_outputs: tuple[float, float, float, float] | None = None
     """What the speed controllers report that their motors do, as commands 0..1 of healthy ones;
     None: what they are told."""
+    odometry: Odometry | None = None
+    """Of external vision that is part of the vehicle."""
 
 
 class ActuatorControls(NamedTuple):

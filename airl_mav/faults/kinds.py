@@ -19,6 +19,7 @@ Part = Literal[
     "mag",
     "baro",
     "gps",
+    "vision",
     "motor1",
     "motor2",
     "motor3",
@@ -39,7 +40,7 @@ Part = Literal[
 Phase = Literal["ground", "climb", "hold", "offboard", "mission", "return", "landing"]
 """Phases of a flight that can set a fault off, by what the flight controller flies."""
 
-SENSORS: tuple[Part, ...] = ("accel", "gyro", "mag", "baro", "gps")
+SENSORS: tuple[Part, ...] = ("accel", "gyro", "mag", "baro", "gps", "vision")
 MOTORS: tuple[Part, ...] = ("motor1", "motor2", "motor3", "motor4")
 LINKS: tuple[Part, ...] = ("link", "uplink", "downlink")
 PROCESSES: tuple[Part, ...] = ("companion", "firmware")
@@ -108,6 +109,13 @@ class _Sensor:
 _IMU_OFF = "its last sample is repeated: flight controllers count time by its samples"
 _METRES = {"m": 1.0}
 
+_DRIFT = {
+    "drift": Kind(
+        "the position drifts away from the true one, and is right again at the end",
+        Amount("velocity, north, east, down", "m/s", -100.0, 100.0, {"m/s": 1.0}, 3),
+    )
+}
+
 _SENSORS: Mapping[Part, _Sensor] = {
     "accel": _Sensor("m/s2", 100.0, {"m/s2": 1.0, "g": GRAVITY_M_S2}, off=_IMU_OFF),
     "gyro": _Sensor("rad/s", 35.0, {"rad/s": 1.0, "deg/s": math.pi / 180.0}, off=_IMU_OFF),
@@ -118,12 +126,15 @@ _SENSORS: Mapping[Part, _Sensor] = {
         100_000.0,
         _METRES,
         bias_meaning="is added to the position, north, east, down: a jump",
-        more={
-            "drift": Kind(
-                "the position drifts away from the true one, and is right again at the end",
-                Amount("velocity, north, east, down", "m/s", -100.0, 100.0, {"m/s": 1.0}, 3),
-            )
-        },
+        more=_DRIFT,
+    ),
+    "vision": _Sensor(
+        "m",
+        100_000.0,
+        _METRES,
+        off="it tells no poses any more",
+        bias_meaning="is added to the position, in the frame of the start: a jump that is not told",
+        more=_DRIFT,
     ),
 }
 

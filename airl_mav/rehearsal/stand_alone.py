@@ -14,6 +14,7 @@ from airl_mav.profiles.loaded import check_spread, equipped
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.firmware_process import build_firmware, unix_us
+from airl_mav.scenario.checks import check_fitted
 from airl_mav.scenario.stand_alone import StandAloneVehicle, check_vehicle
 from firmware_sim.autopilot.autopilot_state import Message
 from firmware_sim.external.programs import how_to_start
@@ -100,6 +101,7 @@ def aircraft_of(asked: StandAloneVehicle) -> tuple[VehicleProfile, float]:
     vehicle, computer = equipped(asked.vehicle, asked.computer, asked.payload)
     check_spread(vehicle, asked.spread)
     check_noise(vehicle.camera, asked.sensors, asked.faults)
+    check_fitted(vehicle.sensors, asked.faults)
     return vehicle, computer.onboard_watts
 
 

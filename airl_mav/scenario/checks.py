@@ -1,11 +1,15 @@
-"""Fields that contradict each other: found before a profile is read or a port is bound."""
+"""Fields that contradict each other, or the vehicle: found before a port is bound."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from airl_mav.core.errors import FieldError
 from airl_mav.faults.kinds import LINKS
+from airl_mav.faults.model import Fault
 from airl_mav.faults.twin import TWIN, check_twin
 from airl_mav.profiles.camera_kind import Renderer
+from airl_mav.profiles.sensors import Sensors
 from airl_mav.scenario.aircraft import GREATEST_PORT, HAS_PYBULLET, NO_TWIN, Aircraft, Ports
 from airl_mav.scenario.model import LevelName, Scenario
 
@@ -66,6 +70,14 @@ def check_faults(asked: Aircraft, level: LevelName) -> None:
             raise FieldError(
                 "faults", str(fault), "with firmware builtin: real firmware has links of its own"
             )
+
+
+def check_fitted(sensors: Sensors, faults: Sequence[Fault]) -> None:
+    """Raise FieldError for a fault of a sensor that the vehicle does not have."""
+    fitted = {"gps": sensors.gps.fitted, "vision": sensors.vision is not None}
+    for fault in faults:
+        if not fitted.get(fault.part, True):
+            raise FieldError("faults", str(fault), f"with a vehicle that has {fault.part}")
 
 
 def check_plant(asked: Aircraft) -> None:

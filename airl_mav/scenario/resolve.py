@@ -13,7 +13,13 @@ from airl_mav.policy.registry import camera_refused, find_policy
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loaded import check_spread, equipped
 from airl_mav.profiles.loading import load_profile
-from airl_mav.scenario.checks import check_firmware, check_level, check_plant, check_ports
+from airl_mav.scenario.checks import (
+    check_firmware,
+    check_fitted,
+    check_level,
+    check_plant,
+    check_ports,
+)
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.piloting import NATIVE_T2_US, check_quota, decide_piloting
 from airl_mav.scenario.resolved import ResolvedScenario
@@ -38,6 +44,7 @@ def resolve(scenario: Scenario) -> ResolvedScenario:
     vehicle, computer = equipped(scenario.vehicle, scenario.computer, scenario.payload)
     check_spread(vehicle, scenario.spread)
     check_noise(vehicle.camera, scenario.sensors, scenario.faults)
+    check_fitted(vehicle.sensors, scenario.faults)
     if reason := camera_refused(policy, vehicle.camera):
         raise FieldError(
             "policy", scenario.policy, problem=f"does not fit vehicle {scenario.vehicle}: {reason}"

@@ -49,7 +49,7 @@ from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.autopilot.port import Failures, LogStore, NoLogs
 from firmware_sim.autopilot.requests import FollowedTarget, LandingTarget, Place, Request
 from firmware_sim.autopilot.snapshot import Parts, snapshot
-from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth
+from firmware_sim.interfaces import ActuatorControls, Odometry, SensorSample, Truth
 
 _STILL: Motors = (0.0, 0.0, 0.0, 0.0)
 
@@ -131,8 +131,11 @@ class BuiltinAutopilot:
         self._newest.take(sample)
         if sample.esc_outputs is not None:
             supervisor.watch.hear_escs(time_us, self._motors, sample.esc_outputs)
-        if self._home.place is None:
-            self._home.set_here()
+        if self._home.place is None and self.estimator.origin is not None:
+            if self.flight.phase < _GROUND:
+                self._home.set_here()
+            else:
+                self._home.locate()
         readiness = READINESS[self.flight.phase][self.estimator.healthy]
         if readiness is not None:
             self._commander.handle(readiness)
@@ -394,6 +397,11 @@ class BuiltinAutopilot:
         if takes_over and self.flight.phase is _AIR and flown is not Mode.ORBIT:
             self._commander.handle(Ask(Mode.POSITION))
             self._say(Message.of(Severity.INFO, events.PILOT_TOOK_OVER))
+
+    def see(self, odometry: Odometry) -> None:
+        """Hand over a pose that something else has estimated."""
+        self.estimator.see(odometry)
+        self._snapshot = None
 
     def follow(self, target: FollowedTarget) -> None:
         """Hand over where the target is that Follow follows."""

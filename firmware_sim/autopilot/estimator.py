@@ -18,24 +18,22 @@ from airl_mav.core.frames import (
     Vector,
     geodetic_to_local,
     local_to_geodetic,
-    quat_from_euler,
 )
 from airl_mav.core.location import MAGNETIC_DECLINATION, MAGNETIC_FIELD_NED
 from airl_mav.vehicle.atmosphere import altitude_m
 from firmware_sim.autopilot import error_state as es
+from firmware_sim.autopilot.alignment import Alignment
 from firmware_sim.autopilot.autopilot_state import Estimate
 from firmware_sim.autopilot.consistency import Compass, Consistency, Restart
 from firmware_sim.autopilot.emergency_yaw import EmergencyYaw, turn_to
 from firmware_sim.autopilot.error_filter import NewFilter
+from firmware_sim.autopilot.external_vision import Control, ExternalVision
 from firmware_sim.autopilot.filter_kernel import KernelFilter
 from firmware_sim.autopilot.fusion_horizon import FusionHorizon
 from firmware_sim.autopilot.magnetic_field import FieldCheck
 from firmware_sim.autopilot.measurement import Measurement, selecting
 from firmware_sim.autopilot.yaw_estimator import YawEstimator
-from firmware_sim.interfaces import GpsFix, SensorSample
-
-ALIGN_S = 0.5
-"""Time at rest over which attitude and barometer are averaged at start [s]."""
+from firmware_sim.interfaces import GpsFix, Odometry, SensorSample
 
 _north, _east, _down = MAGNETIC_FIELD_NED
 # The field dips, so a tilt error turns the measured heading: seen from the world's axes,
@@ -44,17 +42,17 @@ _HEADING_BY_TURN_NED = np.array([-_down * _north, -_down * _east, _north**2 + _e
     _north**2 + _east**2
 )
 
-LONGEST_ALIGN_S = 10.0
-"""Samples at rest that are older are forgotten while a sensor is waited for [s]."""
-
-_NEEDED = ("gps", "mag", "pressure_hpa")
-"""Without one of each there is no alignment."""
+_NO_COMPASS = 5
+"""EKF2_MAG_TYPE: the compass is not used."""
 
 GPS_GONE_US = 1_000_000
 """GPS that was not fused for so long no longer aids the filter (EKF2: its data are late)."""
 
 PROBATION_US = 10 * US_PER_S
 """Inertial sensors that were wrong are doubted for so long (EKF2: BADACC_PROBATION) [µs]."""
+
+_JUDGED_EVERY_US = US_PER_S // 10
+"""What `consistency` counts are samples of a usual GPS."""
 
 BIAS_STEP_S = 0.01
 """PX4's filter runs at 100 Hz; its bias process noises (EKF2_*_B_NOISE) are per such a step [s]."""
@@ -70,7 +68,8 @@ class Estimator:
         """Start unaligned; `value` looks up EKF2_* parameters by name."""
         self._value = value
         self.origin: Geodetic | None = None
-        """Where local NED is zero: the mean of the first fixes; None before alignment."""
+        """Where local NED is zero: the mean of the first fixes, or what somebody has said; None
+        while neither is known."""
         self.state = es.new_state()
         """The nominal state, by `error_state`'s layout."""
         self.healthy = False
@@ -79,14 +78,16 @@ class Estimator:
         """Carries the error's covariance."""
         self.innovations: Callable[[str, Vector, Vector], None] | None = None
         """Called with name, innovation and its covariance for every measurement, if set."""
-        self._resting: list[SensorSample] = []
-        self._seen: set[str] = set()
-        """Which of the slower sensors have measured since alignment began."""
+        self._alignment = Alignment(value)
         self._origin_altitude_baro = 0.0
+        self._judged_us = 0
+        """When a velocity of external vision was last held against the inertial sensors."""
         self._chosen_origin: Geodetic | None = None
         """Where local NED shall be zero, chosen before alignment; None = where the vehicle is."""
         self._time_us = 0
         self._aligned_us: int | None = None
+        self._fixed_us: int | None = None
+        """When it was aligned where GPS had said that it is; None: not yet, or without GPS."""
         self._estimate: Estimate | None = None
         horizontal = selecting(es.POS, es.POS + 1, es.VEL, es.VEL + 1)
         self._gps_horizontal = Measurement("gps_horizontal", 0, horizontal)
@@ -100,6 +101,8 @@ class Estimator:
         self._horizon = FusionHorizon()
         self.yaw = YawEstimator()
         """The heading without a compass."""
+        self.vision = ExternalVision(value, self.state, self.filter, self._fuse, self._judge)
+        """What something else has estimated of the vehicle's pose."""
         self.flying = False
         """Whether the vehicle is in the air; set by whoever knows."""
         self.emergency = EmergencyYaw()
@@ -112,20 +115,31 @@ class Estimator:
     def step(self, sample: SensorSample) -> None:
         """Take one tick's sensors."""
         self._time_us, self._estimate = sample.time_us, None
-        if self.origin is None:
+        if self._aligned_us is None:
             self._align(sample)
         else:
             self._predict(sample)
             self.yaw.feel(sample.gyro, sample.accel)
-            if sample.gps is not None:
-                self._fuse_gps(sample.gps, self.origin)
+            if sample.gps is not None and self._uses_gps:
+                self._fuse_gps(sample.gps)
             if sample.pressure_hpa is not None:
                 self._fuse_baro(sample.pressure_hpa)
             if sample.mag is not None:
                 self._field = sample.mag
                 self._fuse_heading(sample.mag)
+            if sample.odometry is not None:
+                self.see(sample.odometry)
+            elif self.vision.fused:
+                self.vision.look(sample.time_us)
         converged = es.converged(self.state, self.filter.covariance)
-        self.healthy = converged and self.origin is not None
+        self.healthy = converged and self._aligned_us is not None
+
+    def see(self, odometry: Odometry) -> None:
+        """Take what something else has estimated, now."""
+        if self._aligned_us is not None:
+            gps = self._uses_gps and self.fuses_gps(self._time_us)
+            self.vision.take(odometry, self._time_us, gps=gps, flying=self.flying)
+            self._estimate = None
 
     def estimate(self) -> Estimate:
         """Return a copy of the estimate after the newest tick."""
@@ -153,6 +167,9 @@ class Estimator:
         """
         before, self._chosen_origin = self.origin, origin
         if before is None:
+            if self._aligned_us is not None:
+                # Local NED goes on, and is now known to lie there.
+                self.origin, self._estimate = origin, None
             return
         here = local_to_geodetic(self.state[es.P : es.V], before)
         self.state[es.P : es.V] = geodetic_to_local(here, origin)
@@ -168,15 +185,31 @@ class Estimator:
         the ground, where the biases have hardly been learnt, nobody begins a flight so.
         """
         longest_us = self._value("EKF2_NOAID_TOUT") if flying else GPS_GONE_US
-        return self.origin is not None and self._recent(self._gps_horizontal, now_us, longest_us)
+        if self._aligned_us is None:
+            return False
+        vision = self.vision
+        return self._recent(self._gps_horizontal, now_us, longest_us) or any(
+            m.fused_us is not None and now_us - m.fused_us <= longest_us
+            for m in (vision.position, vision.velocity)
+        )
 
     def knows_height(self, now_us: int) -> bool:
         """Return whether height and vertical speed are valid: barometer or GPS, as above."""
         longest_us = self._value("EKF2_NOAID_TOUT")
-        return self.origin is not None and (
-            self._recent(self._baro, now_us, longest_us)
-            or self._recent(self._gps_vertical, now_us, longest_us)
+        return self._aligned_us is not None and any(
+            self._recent(m, now_us, longest_us)
+            for m in (self._baro, self._gps_vertical, self.vision.height)
         )
+
+    @property
+    def aligned(self) -> bool:
+        """Whether the attitude is known: the sensors have been averaged at rest."""
+        return self._aligned_us is not None
+
+    @property
+    def knows_place(self) -> bool:
+        """Whether a position in local NED is one on the globe, too."""
+        return self.origin is not None and self.vision.is_north_known
 
     def fuses_gps(self, now_us: int) -> bool:
         """Return whether GPS has been fused lately."""
@@ -202,50 +235,30 @@ class Estimator:
         return math.hypot(north, east), math.hypot(v_north, v_east)
 
     def _recent(self, m: Measurement, now_us: int, longest_us: float) -> bool:
-        """Return whether it was fused lately; right after alignment all are."""
-        since = self._aligned_us if m.fused_us is None else m.fused_us
+        """Return whether it was fused lately; right after alignment by GPS all are."""
+        since = self._fixed_us if m.fused_us is None else m.fused_us
         return since is not None and now_us - since <= longest_us
 
     # --- start
 
     def _align(self, sample: SensorSample) -> None:
-        """Average the sensors at rest; then level by gravity and point by the magnetic field."""
-        self._resting.append(sample)
-        self._seen |= self._kinds(sample)
-        elapsed_s = (sample.time_us - self._resting[0].time_us) / US_PER_S
-        if elapsed_s < ALIGN_S or len(self._seen) < len(_NEEDED):
-            if elapsed_s > LONGEST_ALIGN_S:
-                self._forget()
+        aligned = self._alignment.take(sample)
+        self._field = self._alignment.field
+        if aligned is None:
             return
-        ax, ay, az = np.mean([s.accel for s in self._resting], axis=0)
-        roll, pitch = math.atan2(-ay, -az), math.atan2(ax, math.hypot(ay, az))
-        field = np.mean([s.mag for s in self._resting if s.mag is not None], axis=0)
-        level = tuple(quat_from_euler(roll, pitch, 0.0).tolist())
-        self._field = field
-        if FieldCheck.read(self._value).disturbed(field, level):
-            # A heading by it would be wrong, and nothing would tell before the vehicle moves.
-            self._forget()
-            return
-        heading = es.true_heading(field, level, MAGNETIC_DECLINATION)
-        self.state[es.Q : es.RATES] = quat_from_euler(roll, pitch, heading)
-        baro = [altitude_m(s.pressure_hpa) for s in self._resting if s.pressure_hpa is not None]
-        self._origin_altitude_baro = float(np.mean(baro))
-        fixes = [s.gps.position for s in self._resting if s.gps is not None]
-        here = Geodetic(*(float(c) for c in np.mean(fixes, axis=0)))
-        self.origin = here
+        self._aligned_us = sample.time_us
+        self.state[es.Q : es.RATES] = aligned.quaternion
+        self.vision.is_north_known = aligned.by_compass
+        self._origin_altitude_baro = aligned.altitude_baro_m
+        if aligned.fix is not None:
+            self.origin, self._fixed_us = aligned.fix, sample.time_us
         if self._chosen_origin is not None:
             self.move_origin(self._chosen_origin)
-        self._aligned_us = sample.time_us
-        self._resting.clear()
 
-    @staticmethod
-    def _kinds(sample: SensorSample) -> set[str]:
-        return {name for name in _NEEDED if getattr(sample, name) is not None}
-
-    def _forget(self) -> None:
-        """A sensor is missing: keep the newer half of the samples, so that memory stays bounded."""
-        self._resting = self._resting[len(self._resting) // 2 :]
-        self._seen = set().union(*(self._kinds(sample) for sample in self._resting))
+    @property
+    def _uses_gps(self) -> bool:
+        """Whether GPS is fused, by EKF2_GPS_CTRL."""
+        return self._value("EKF2_GPS_CTRL") != 0
 
     def _process_noise(self) -> Vector:
         value = self._value
@@ -258,11 +271,12 @@ class Estimator:
         return q
 
     def _predict(self, sample: SensorSample) -> None:
-        state, horizon = self.state, self._horizon
-        before = state[es.P : es.Q].copy() if horizon.is_past else None
+        state, horizon, seen = self.state, self._horizon, self.vision.horizon
+        before = state[es.P : es.Q].copy() if horizon.is_past or seen.is_past else None
         self.filter.predict(state, sample.gyro, sample.accel)
         if before is not None:
-            horizon.moved(before, state[es.P : es.Q])
+            for each in (horizon, seen):
+                each.moved(before, state[es.P : es.Q])
 
     # --- measurements
 
@@ -275,13 +289,17 @@ class Estimator:
         if ratio <= 1.0:
             m.fused_us = self._time_us
 
-    def _fuse_gps(self, fix: GpsFix, origin: Geodetic) -> None:
-        measured, value = geodetic_to_local(fix.position, origin), self._value
+    def _fuse_gps(self, fix: GpsFix) -> None:
+        if self.origin is None:
+            # Vision has said where the vehicle is; now it is known where that is.
+            self.origin = local_to_geodetic(-self.state[es.P : es.V], fix.position)
+        measured, value = geodetic_to_local(fix.position, self.origin), self._value
         r_p, r_v = value("EKF2_GPS_P_NOISE") ** 2, value("EKF2_GPS_V_NOISE") ** 2
         self._horizon.assume(value("EKF2_GPS_DELAY"))
         self._observe_yaw(fix.velocity_ned, math.sqrt(r_v))
-        r_v, restart = self._check_velocity(fix.velocity_ned - self._then()[3:], r_v)
-        self._answer(restart)
+        excess = self.consistency.velocity_excess
+        self._answer(self._check_velocity(fix.velocity_ned - self._then()[3:], r_v))
+        r_v *= excess
         if self._heading_is_due and self._suspects_heading:
             self._reset_heading(measured, fix.velocity_ned, r_p, r_v)
         m, then = self._gps_horizontal, self._then()
@@ -294,7 +312,8 @@ class Estimator:
         m.innovation[1] = fix.velocity_ned[2] - then[5]
         # A receiver's height is about half as good as its horizontal position.
         m.variance[0], m.variance[1] = max(fix.epv_m, math.sqrt(r_p)) ** 2, r_v
-        self._fuse(m)
+        if not self.vision.fused & Control.VERTICAL:
+            self._fuse(m)
 
     def _observe_yaw(self, velocity: Vector, accuracy: float) -> None:
         state = self.state
@@ -316,6 +335,8 @@ class Estimator:
         self._fuse(self._baro)
 
     def _fuse_heading(self, field: Vector) -> None:
+        if self.vision.fused & Control.YAW or self._value("EKF2_MAG_TYPE") == _NO_COMPASS:
+            return
         m = self._heading
         observable = es.observe_heading(
             self.state, field, MAGNETIC_DECLINATION, _HEADING_BY_TURN_NED, m.innovation, m.h
@@ -332,13 +353,19 @@ class Estimator:
 
     # --- inertial sensors that have gone wrong
 
-    def _check_velocity(self, innovation: Vector, variance: float) -> tuple[float, Restart | None]:
-        """Return the variance of a measured velocity, and what to restart the filter with."""
-        excess = self.consistency.velocity_excess
+    def _judge(self, innovation: Vector, variance: Vector) -> float:
+        """Hold a velocity of external vision against the inertial sensors, as often as GPS's."""
+        by_gps = self._uses_gps and self.fuses_gps(self._time_us)
+        if not by_gps and self._time_us - self._judged_us >= _JUDGED_EVERY_US:
+            self._judged_us = self._time_us
+            self._answer(self._check_velocity(innovation, variance))
+        return self.consistency.velocity_excess
+
+    def _check_velocity(self, innovation: Vector, variance: float | Vector) -> Restart | None:
+        """Return what a measured velocity of some variance says to restart the filter with."""
         sigma = np.sqrt(self.filter.covariance.diagonal()[es.VEL : es.ATT] + variance)
         acceleration = self.state[es.ACCELERATION : es.SIGMA]
-        restart = self.consistency.velocity(innovation, sigma, acceleration, self._time_us)
-        return variance * excess, restart
+        return self.consistency.velocity(innovation, sigma, acceleration, self._time_us)
 
     @property
     def _heading_is_due(self) -> bool:

@@ -1,4 +1,4 @@
-"""What GPS fixes are compared with, where they are known to come late (EKF2_GPS_DELAY).
+"""What fixes are compared with, where they are known to come late (EKF2_GPS_DELAY, EKF2_EV_DELAY).
 
 A fix that was measured some time ago says where the vehicle was then. PX4 runs its whole filter in
 that past and predicts the present from it. Here the filter runs in the present, and the fix is
@@ -26,16 +26,21 @@ nothing, so that only what is assumed beyond it counts [ms]."""
 class FusionHorizon:
     """How position and velocity have changed by prediction since the horizon."""
 
-    def __init__(self) -> None:
-        """Begin in the present: fixes are not late."""
+    def __init__(self, simulated_ms: float = SIMULATED_MS) -> None:
+        """Begin in the present: fixes are not late.
+
+        Args:
+            simulated_ms: What of the assumed delay fixes do not have here [ms].
+        """
+        self._simulated_ms = simulated_ms
         self.is_past = False
         """Whether it lies in the past; if not, `moved` need not be called."""
         self._travelled = np.zeros(Q - P)
         self._log: deque[Vector] = deque([self._travelled], maxlen=1)
 
     def assume(self, delay_ms: float) -> None:
-        """Put it so far back as fixes are assumed to be late: EKF2_GPS_DELAY [ms]."""
-        late_us = (delay_ms - SIMULATED_MS) * US_PER_MS
+        """Put it so far back as fixes are assumed to be late [ms]."""
+        late_us = (delay_ms - self._simulated_ms) * US_PER_MS
         length = 1 + max(0, round(late_us / TICK_US))
         if length != self._log.maxlen:
             self._log = deque([self._travelled], maxlen=length)

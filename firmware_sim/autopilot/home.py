@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from airl_mav.core.frames import Geodetic, geodetic_to_local, local_to_geodetic
 from firmware_sim.autopilot.error_state import SIGMA, P, V
 from firmware_sim.autopilot.estimator import Estimator
@@ -24,9 +26,12 @@ class Home:
         self._is_chosen = False
         """Whether a client or a mission has placed it: arming does not move it."""
 
-    def boot(self) -> bool:
-        """Set it as soon as there is a fix; return whether it is new."""
-        return self.place is None and self.set_here()
+    def locate(self) -> None:
+        """Set it in flight, once it is known where on the globe the vehicle was armed."""
+        origin, context = self._estimator.origin, self._guidance.context
+        if origin is not None:
+            self.place = local_to_geodetic(np.array(context.home), origin)
+            context.home_amsl_m = self.place.altitude_m
 
     def stands(self) -> None:
         """Follow a disarmed vehicle that stands elsewhere, unless home was chosen.
@@ -45,10 +50,13 @@ class Home:
 
     def armed(self) -> bool:
         """Set it to where the vehicle was armed, unless it was chosen; return whether it is new."""
+        if self._estimator.origin is None:
+            self._guidance.at_home(self._estimator.state)
+            return False
         return not self._is_chosen and self.set_here()
 
     def set_here(self) -> bool:
-        """Set it to the present position; return False without a fix."""
+        """Set it to the present position; return False where that is unknown on the globe."""
         origin, state = self._estimator.origin, self._estimator.state
         if origin is None:
             return False

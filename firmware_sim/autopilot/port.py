@@ -15,7 +15,7 @@ from firmware_sim.autopilot.events.definition import Event
 from firmware_sim.autopilot.manual_control import Source, Sticks
 from firmware_sim.autopilot.navigation.plan import Plans
 from firmware_sim.autopilot.requests import FollowedTarget, LandingTarget, Request
-from firmware_sim.interfaces import SensorSample
+from firmware_sim.interfaces import Odometry, SensorSample
 
 
 @dataclass(frozen=True, slots=True)
@@ -238,6 +238,10 @@ class AutopilotPort(Protocol):
 
     def manual_control(self, sticks: Sticks, source: Source, time_us: int) -> None:
         """Hand over the pilot's sticks, received at `time_us` of simulated time."""
+        ...
+
+    def see(self, odometry: Odometry) -> None:
+        """Hand over a pose that something else has estimated, received now."""
         ...
 
     def follow(self, target: FollowedTarget) -> None:

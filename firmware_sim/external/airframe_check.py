@@ -139,6 +139,15 @@ def ardupilot_airframe(vehicle: VehicleProfile) -> Airframe:
     )
 
 
+def refuse_vision(vehicle: VehicleProfile, firmware: str) -> None:
+    """Raise FirmwareMissingError for a vehicle whose vision no such firmware would be told of."""
+    if vehicle.sensors.vision is not None:
+        raise FirmwareMissingError(
+            f"--firmware {firmware}: the vehicle has sensors.vision, which only builtin and px4 are"
+            " told of"
+        )
+
+
 def _ardupilot_problem(
     motors: Sequence[Corner], kind: Mapping[str, int], held: Mapping[str, Value]
 ) -> str | None:

@@ -17,10 +17,17 @@ from airl_mav.core.constants import TICK_S, US_PER_S
 from airl_mav.core.frames import Vector, local_to_geodetic
 from airl_mav.profiles.sensors import Sensors
 from firmware_sim.faults.timeline import Acting
-from firmware_sim.interfaces import GpsFix, SensorSample
+from firmware_sim.interfaces import GpsFix, Odometry, SensorSample
 from firmware_sim.plant.sensors import PA_PER_HPA
 
-FIELDS = {"accel": "accel", "gyro": "gyro", "mag": "mag", "baro": "pressure_hpa", "gps": "gps"}
+FIELDS = {
+    "accel": "accel",
+    "gyro": "gyro",
+    "mag": "mag",
+    "baro": "pressure_hpa",
+    "gps": "gps",
+    "vision": "odometry",
+}
 """Field of a sample, by the sensor's name."""
 
 INERTIAL = ("accel", "gyro")
@@ -114,29 +121,36 @@ class Noisy:
         moved = shifted(value, error[:3])
         if isinstance(moved, GpsFix):
             return moved._replace(velocity_ned=moved.velocity_ned + error[3:])
+        if isinstance(moved, Odometry) and moved.velocity is not None:
+            return moved._replace(velocity=moved.velocity + error[3:])
         return moved
 
 
 def shifted(value: Any, offset: Vector) -> Any:
-    """Return a measured value with an error: of a fix, its position NED [m]."""
+    """Return a measured value with an error: of a fix, its position NED; of a pose, its own [m]."""
     if isinstance(value, GpsFix):
         return value._replace(position=local_to_geodetic(offset, value.position))
+    if isinstance(value, Odometry):
+        return value if value.position is None else value._replace(position=value.position + offset)
     if isinstance(value, float):
         return value + offset.item(0)
     return value + offset
 
 
 def noise_sd(part: str, profile: Sensors, tick_s: float) -> Vector:
-    """Return the standard deviations of a sensor's noise: of a fix, position and velocity NED."""
+    """Return the sd of a sensor's noise: of a fix or a pose, position (3) and velocity (3)."""
     white = math.sqrt(TICK_S / tick_s)
     gps = profile.gps
     horizontal, speed = gps.horizontal_noise_m, gps.velocity_noise_m_s
+    vision = profile.vision
+    seen = (0.0, 0.0) if vision is None else (vision.position_noise_m, vision.velocity_noise_m_s)
     known: dict[str, list[float]] = {
         "accel": [profile.imu.accel_noise_m_s2 * white] * 3,
         "gyro": [profile.imu.gyro_noise_rad_s * white] * 3,
         "mag": [profile.magnetometer.noise_gauss] * 3,
         "baro": [profile.barometer.noise_pa / PA_PER_HPA],
         "gps": [horizontal, horizontal, gps.vertical_noise_m, speed, speed, speed],
+        "vision": [seen[0]] * 3 + [seen[1]] * 3,
     }
     return np.array(known[part])
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 
 import numpy as np
 
@@ -10,10 +11,17 @@ from airl_mav.core.constants import TICK_S, US_PER_S
 from airl_mav.core.frames import Vector, local_to_geodetic
 from airl_mav.core.kernels import kernel
 from airl_mav.core.location import HOME, MAGNETIC_FIELD_NED
-from airl_mav.profiles.sensors import Barometer, Gps, Magnetometer, Sensors
+from airl_mav.profiles.sensors import Barometer, Gps, Magnetometer, Sensors, Vision
 from airl_mav.vehicle.atmosphere import pressure_hpa, temperature_c
-from airl_mav.vehicle.rotation import conjugate, rotate
-from firmware_sim.interfaces import BatterySample, GpsFix, SensorSample
+from airl_mav.vehicle.rotation import (
+    Quat,
+    conjugate,
+    exponential,
+    multiply,
+    rotate,
+    yaw_of,
+)
+from firmware_sim.interfaces import BatterySample, GpsFix, Odometry, SensorSample
 from firmware_sim.plant.kinematics import POSITION, VELOCITY, force, quaternion, rates
 
 PA_PER_HPA = 100.0
@@ -165,6 +173,69 @@ class _Gps:
         )
 
 
+class _Vision:
+    """Visual-inertial odometry: a pose in the frame of the start, which drifts, told late."""
+
+    def __init__(self, vision: Vision, rng: np.random.Generator, times: float) -> None:
+        self.rate = Rate(vision.rate_hz)
+        self._vision, self._times = vision, times
+        self._white = _White(rng, 13)
+        self._start: tuple[Vector, Vector] | None = None
+        """Position, and attitude of the frame, at the first pose."""
+        self._last = np.zeros(3)
+        self._drift = np.zeros(3)
+        """Of the position, in the frame [m]."""
+        self._turned = 0.0
+        """How far the frame's heading has drifted [rad]."""
+        self._late: deque[tuple[float, Odometry]] = deque()
+        """When each pose is told [µs], oldest first."""
+
+    def observe(self, time_us: int, row: Vector) -> None:
+        """Take a pose now."""
+        profile, white, times = self._vision, self._white.draw(), self._times
+        place, velocity, attitude = row[POSITION], row[VELOCITY], quaternion(row)
+        if self._start is None:
+            self._start, self._last = (place.copy(), frame_at(attitude)), place.copy()
+        start, frame = self._start
+        way = float(np.linalg.norm(place - self._last))
+        self._last = place.copy()
+        self._drift += times * profile.position_drift_m_sqrt_m * math.sqrt(way) * white[0:3]
+        period_s = 1.0 / profile.rate_hz
+        walk = times * profile.yaw_drift_rad_sqrt_s * math.sqrt(period_s)
+        self._turned += walk * white.item(3)
+        half = 0.5 * self._turned
+        into = multiply((math.cos(half), 0.0, 0.0, math.sin(half)), conjugate(tuple(frame)))
+        seen = rotate(into, tuple(place - start))
+        moving = rotate(into, tuple(velocity))
+        error = exponential(tuple(times * profile.angle_noise_rad * white[4:7]))
+        odometry = Odometry(
+            position=np.array(seen) + self._drift + times * profile.position_noise_m * white[7:10],
+            velocity=np.array(moving) + times * profile.velocity_noise_m_s * white[10:13],
+            quaternion=np.array(multiply(multiply(into, attitude), error)),
+            pose_frame="frd",
+            velocity_frame="frd",
+            position_variance=np.full(3, profile.position_noise_m**2),
+            velocity_variance=np.full(3, profile.velocity_noise_m_s**2),
+            orientation_variance=np.full(3, profile.angle_noise_rad**2),
+        )
+        self._late.append((time_us + profile.delay_s * US_PER_S, odometry))
+
+    @property
+    def told_us(self) -> float:
+        """When the next pose is told [µs]; inf = none is on its way."""
+        return self._late[0][0] if self._late else math.inf
+
+    def read(self) -> Odometry:
+        """Return the pose that is due."""
+        return self._late.popleft()[1]
+
+
+def frame_at(attitude: Quat) -> Vector:
+    """Return the frame of a vehicle's start: its heading, level (quaternion to NED)."""
+    half = 0.5 * yaw_of(attitude)
+    return np.array([math.cos(half), 0.0, 0.0, math.sin(half)])
+
+
 class SensorSuite:
     """All sensors of the vehicle; one call a tick.
 
@@ -189,7 +260,7 @@ class SensorSuite:
                 its accuracy stays: nobody is told.
         """
         imu = profile.imu
-        inertial, compass, barometer, gps = rng.spawn(4)
+        inertial, compass, barometer, gps, vision = rng.spawn(5)
         walk = math.sqrt(tick_s)
         # The profile's noise is that of a sample at the base tick: its density stays.
         white = math.sqrt(TICK_S / tick_s)
@@ -207,8 +278,14 @@ class SensorSuite:
         self._white = _White(inertial, 12)
         self._compass = _Compass(profile.magnetometer, compass, times)
         self._barometer = _Barometer(profile.barometer, barometer, times)
-        self._gps = _Gps(profile.gps, gps, times)
-        self._rates = (self._compass.rate, self._barometer.rate, self._gps.rate)
+        self._gps = _Gps(profile.gps, gps, times) if profile.gps.fitted else None
+        self._rates = [self._compass.rate, self._barometer.rate]
+        if self._gps is not None:
+            self._rates.append(self._gps.rate)
+        self._vision = None
+        if profile.vision is not None:
+            self._vision = _Vision(profile.vision, vision, times)
+            self._rates.append(self._vision.rate)
         self._slow_us = 0.0
         """Simulated time before which none of the slower ones is due [µs]."""
 
@@ -222,6 +299,19 @@ class SensorSuite:
             return SensorSample(time_us, accel, gyro, air, battery)
         mag = self._compass.read(row) if self._compass.rate.due(time_us) else None
         pressure = self._barometer.read(altitude) if self._barometer.rate.due(time_us) else None
-        gps = self._gps.read(row) if self._gps.rate.due(time_us) else None
+        gps = None
+        if self._gps is not None and self._gps.rate.due(time_us):
+            gps = self._gps.read(row)
+        odometry = None if self._vision is None else self._see(self._vision, time_us, row)
         self._slow_us = min(rate.next_us for rate in self._rates)
-        return SensorSample(time_us, accel, gyro, air, battery, mag, pressure, gps)
+        if self._vision is not None:
+            self._slow_us = min(self._slow_us, self._vision.told_us)
+        return SensorSample(
+            time_us, accel, gyro, air, battery, mag, pressure, gps, odometry=odometry
+        )
+
+    @staticmethod
+    def _see(vision: _Vision, time_us: int, row: Vector) -> Odometry | None:
+        if vision.rate.due(time_us):
+            vision.observe(time_us, row)
+        return vision.read() if vision.told_us <= time_us else None

@@ -34,7 +34,7 @@ from firmware_sim.autopilot.navigation.plan import Plans
 from firmware_sim.autopilot.navigation.progress import progress
 from firmware_sim.autopilot.port import Failures, LogStore, NoLogs, ParameterValue
 from firmware_sim.autopilot.requests import FollowedTarget, LandingTarget, Request
-from firmware_sim.interfaces import BatterySample, GpsFix, SensorSample
+from firmware_sim.interfaces import BatterySample, GpsFix, Odometry, SensorSample
 
 ORIGIN = Geodetic(47.397743, 8.545594, 489.4)
 READY_US = 100_000
@@ -126,6 +126,7 @@ class KinematicAutopilot:
         self.accel = np.array([0.1, -0.2, -GRAVITY_M_S2])
         self.gyro = np.zeros(3)
         self.setpoints: list[tuple[Setpoint, int]] = []
+        self.odometry: list[Odometry] = []
         self.gcs_heartbeats: list[int] = []
         self.takeoffs: list[float | None] = []
         self.takeoff_place: tuple[float, float] | None = None
@@ -240,6 +241,9 @@ class KinematicAutopilot:
 
     def manual_control(self, sticks: Sticks, source: Source, time_us: int) -> None:
         self.sticks.append((sticks, source, time_us))
+
+    def see(self, odometry: Odometry) -> None:
+        self.odometry.append(odometry)
 
     def landing_target(self, target: LandingTarget) -> None:
         self.landing_targets.append(target)

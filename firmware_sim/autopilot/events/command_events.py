@@ -83,6 +83,13 @@ LANDING_TARGET_FRAME = Definition(
     Level.ERROR,
 )
 
+ODOMETRY_ESTIMATOR = Definition(
+    "mavlink_rcv_odom_unsup_estimator_type",
+    "ODOMETRY: unsupported estimator_type {1}",
+    arguments("uint8_t estimator_type"),
+    Level.ERROR,
+)
+
 # --- calibrations
 
 RC_CALIBRATION = Definition("commander_calib_rc_off", "Calibration: Disabling RC input")

@@ -101,6 +101,7 @@ class Watch:
         self._takeoff_us: int | None = None
         self._local, self._relaxed, self._velocity = Validity(), Validity(), Validity()
         self._gps_fused = False
+        self._vision_fused = False
         self._restarts = 0
         self._compass_given_up = False
 
@@ -160,7 +161,7 @@ class Watch:
         accuracy, speed_accuracy = estimator.accuracy()
         position = estimator.knows_position(now_us, flying=phase is _AIR)
         needed = p.com_pos_fs_eph if p.com_pos_fs_eph >= 0.0 else math.inf
-        if estimator.origin is not None:
+        if estimator.aligned:
             for validity, sigma, limit in (
                 (self._local, accuracy, needed),
                 (self._relaxed, accuracy, math.inf),
@@ -177,7 +178,7 @@ class Watch:
         return Conditions(
             angular_velocity_invalid=not self.sensors.gyro.has_data(now_us),
             attitude_invalid=not (
-                estimator.origin is not None
+                estimator.aligned
                 and self.sensors.gyro.has_data(now_us)
                 and self.sensors.accel.has_data(now_us)
             ),
@@ -185,7 +186,7 @@ class Watch:
             local_position_invalid=not local,
             local_position_invalid_relaxed=not self._relaxed.valid,
             local_velocity_invalid=not self._velocity.valid,
-            global_position_invalid=not local,
+            global_position_invalid=not (local and estimator.knows_place),
             local_position_accuracy_low=local and 0.0 < p.com_pos_low_eph < accuracy,
             home_position_invalid=estimator.origin is None,
             auto_mission_missing=reports.mission_missing,
@@ -221,10 +222,17 @@ class Watch:
                 texts.append(Message.of(Severity.INFO, events.GNSS_STARTED))
             elif phase >= _GROUND:
                 texts.append(Message.of(Severity.WARNING, events.GNSS_STOPPED))
+        seen = bool(self._estimator.vision.fused)
+        if seen is not self._vision_fused:
+            self._vision_fused = seen
+            if phase >= _GROUND:
+                text = f"External vision fusion {'started' if seen else 'stopped'}"
+                texts.append(Message(Severity.INFO if seen else Severity.WARNING, text))
         estimator = self._estimator
         if estimator.consistency.restarts != self._restarts:
             self._restarts = estimator.consistency.restarts
-            text = "Estimator biases reset: IMU and GNSS disagree"
+            other = "GNSS" if fused else "vision"
+            text = f"Estimator biases reset: IMU and {other} disagree"
             texts.append(Message(Severity.WARNING, text))
         if estimator.compass.given_up is not self._compass_given_up:
             given_up = self._compass_given_up = estimator.compass.given_up

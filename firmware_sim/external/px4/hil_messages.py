@@ -13,12 +13,13 @@ from typing import NamedTuple, TypeAlias
 from airl_mav.core.constants import DEG, GRAVITY_M_S2
 from airl_mav.core.frames import Geodetic, Vector
 from airl_mav.vehicle.atmosphere import altitude_m
-from firmware_sim.interfaces import ActuatorControls, GpsFix, SensorSample
+from firmware_sim.interfaces import ActuatorControls, GpsFix, Odometry, SensorSample
 from firmware_sim.mavlink.codec import Reader, Values, WireMessage, dialect, layout
 
 SENSOR = layout("HIL_SENSOR")
 GPS = layout("HIL_GPS")
 STATE = layout("HIL_STATE_QUATERNION")
+ODOMETRY = layout("ODOMETRY")
 
 
 class Answer(NamedTuple):
@@ -58,6 +59,9 @@ _ID = 0
 
 _YAW_UNAVAILABLE = 0
 _NO_AIRSPEED = 0.0
+
+_POSE_FRAMES = {"ned": dialect.MAV_FRAME_LOCAL_NED, "frd": dialect.MAV_FRAME_LOCAL_FRD}
+_VELOCITY_FRAMES = {**_POSE_FRAMES, "body": dialect.MAV_FRAME_BODY_FRD}
 
 _COURSE_MIN_M_S = 0.1
 """Slower than this a GPS knows no course."""
@@ -124,6 +128,24 @@ def gps(fix: GpsFix, time_us: int) -> Values:
     )
 
 
+def odometry(seen: Odometry, time_us: int) -> Values:
+    """Return ODOMETRY at the firmware's time [µs]; what is not measured is NaN."""
+    return (
+        time_us,
+        _POSE_FRAMES[seen.pose_frame],
+        _VELOCITY_FRAMES[seen.velocity_frame],
+        *_known(seen.position, 3),
+        *_known(seen.quaternion, 4),
+        *_known(seen.velocity, 3),
+        *_known(None, 3),
+        *_covariance(*seen.position_variance.tolist(), *seen.orientation_variance.tolist()),
+        *_covariance(*seen.velocity_variance.tolist(), *_known(None, 3)),
+        seen.reset_counter,
+        dialect.MAV_ESTIMATOR_TYPE_VIO,
+        seen.quality,
+    )
+
+
 def armed(message: Controls) -> bool:
     """Return whether HIL_ACTUATOR_CONTROLS says armed."""
     return bool(message.mode & dialect.MAV_MODE_FLAG_SAFETY_ARMED)
@@ -163,6 +185,15 @@ def controls(message: Controls, time_us: int) -> ActuatorControls:
             )
     a, b, c, d = (min(1.0, max(0.0, value)) for value in (a, b, c, d))
     return ActuatorControls(time_us, (a, b, c, d), armed=True)
+
+
+def _known(values: Vector | None, width: int) -> tuple[float, ...]:
+    return (math.nan,) * width if values is None else tuple(values.tolist())
+
+
+def _covariance(a: float, b: float, c: float, d: float, e: float, f: float) -> Values:
+    """Return the upper triangle, row by row, of a 6 x 6 matrix with that diagonal, else 0."""
+    return a, 0, 0, 0, 0, 0, b, 0, 0, 0, 0, c, 0, 0, 0, d, 0, 0, e, 0, f
 
 
 def _saturated(measured: Vector, limit: float) -> tuple[float, float, float]:

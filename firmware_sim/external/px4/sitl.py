@@ -207,6 +207,9 @@ class Px4Bridge:
         data = b""
         if sample.gps is not None:
             data += encoder.frame(hil.GPS, hil.GPS.payload(hil.gps(sample.gps, now_us)))
+        if sample.odometry is not None:
+            seen = hil.odometry(sample.odometry, now_us)
+            data += encoder.frame(hil.ODOMETRY, hil.ODOMETRY.payload(seen))
         if now_us >= self._state_due_us and self._truth is not None:
             # Keeps its phase, skips what it missed.
             late_us = now_us - self._state_due_us

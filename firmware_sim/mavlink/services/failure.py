@@ -28,13 +28,13 @@ SENSORS: dict[int, tuple[Part | None, tuple[int, ...]]] = {
     dialect.FAILURE_UNIT_SENSOR_MAG: ("mag", (OK, OFF, STUCK)),
     dialect.FAILURE_UNIT_SENSOR_BARO: ("baro", (OK, OFF, STUCK)),
     dialect.FAILURE_UNIT_SENSOR_GPS: ("gps", (OK, OFF)),
-    # The vehicle has none of these; PX4 takes the command all the same.
+    dialect.FAILURE_UNIT_SENSOR_VIO: ("vision", (OK, OFF)),
+    # The vehicle has none; PX4 takes the command all the same.
     dialect.FAILURE_UNIT_SENSOR_AIRSPEED: (None, (OK, OFF, WRONG)),
-    dialect.FAILURE_UNIT_SENSOR_VIO: (None, (OK, OFF)),
 }
 """Part and accepted types of each sensor; other types are UNSUPPORTED."""
 
-WITHOUT_INSTANCE: tuple[Part, ...] = ("baro", "gps")
+WITHOUT_INSTANCE: tuple[Part, ...] = ("baro", "gps", "vision")
 """Sensors of which PX4 has one, whatever instance is named."""
 
 KINDS = {OFF: "off", STUCK: "stuck"}

@@ -1,0 +1,344 @@
+"""External vision: poses that a companion computer or a camera system estimates, fused as by PX4.
+
+EKF2_EV_CTRL says what is fused: 1 horizontal position, 2 vertical position, 4 velocity, 8 heading.
+Source: PX4 1.16, EKF/aid_sources/external_vision. Not taken over is its estimate of a bias between
+two sources of position: where GPS is fused the position of vision waits, and where the height's
+reference is another one (EKF2_HGT_REF) so does its height.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from enum import IntFlag
+
+import numpy as np
+
+from airl_mav.core.frames import Vector, quat_to_matrix
+from airl_mav.vehicle.rotation import conjugate, multiply, normalize, yaw_of
+from firmware_sim.autopilot import error_state as es
+from firmware_sim.autopilot.emergency_yaw import turn_to
+from firmware_sim.autopilot.error_filter import ErrorFilter
+from firmware_sim.autopilot.fusion_horizon import FusionHorizon
+from firmware_sim.autopilot.measurement import Measurement, selecting
+from firmware_sim.autopilot.sensor_monitor import LEARN_US
+from firmware_sim.interfaces import Odometry
+
+LONGEST_INTERVAL_US = 200_000
+"""Odometry has to come at least so often before it is fused (EV_MAX_INTERVAL) [µs]."""
+
+SILENT_US = 2 * LONGEST_INTERVAL_US
+"""After so long without any it is no longer fused [µs]."""
+
+RESETS = 5
+"""In the air the position may be put to what vision says so often."""
+
+LEAST_VARIANCE = 0.01**2
+"""PX4's floor of the variance of a position [m²] and of a heading [rad²]."""
+
+FRAME_SHARE = 0.001
+"""Share of a new sample in what is known of how vision's frame is turned (PX4's filter)."""
+
+HEIGHT_BY_VISION = 3
+"""EKF2_HGT_REF."""
+
+
+class Control(IntFlag):
+    """Bits of EKF2_EV_CTRL."""
+
+    HORIZONTAL = 1
+    VERTICAL = 2
+    VELOCITY = 4
+    YAW = 8
+
+
+class ExternalVision:
+    """Takes odometry and has the filter fuse what of it is asked for."""
+
+    def __init__(
+        self,
+        value: Callable[[str], float],
+        state: Vector,
+        error_filter: ErrorFilter,
+        fuse: Callable[[Measurement], None],
+        judge: Callable[[Vector, Vector], float],
+    ) -> None:
+        """Begin without any.
+
+        Args:
+            value: Looks up EKF2_* parameters by name.
+            state: The nominal state, by `error_state`'s layout; updated.
+            error_filter: Carries its covariance; restarted where the state is put elsewhere.
+            fuse: Fuses a measurement now.
+            judge: Looks at the innovation (3,) of a velocity of some variance (3,), restarts the
+                filter where that says that inertial sensors are wrong, and returns how many times
+                the variance the velocity's is.
+        """
+        self._value, self._state, self._filter = value, state, error_filter
+        self._fuse, self._judge = fuse, judge
+        self.horizon = FusionHorizon(0.0)
+        """Where the vehicle was when odometry that comes now was measured (EKF2_EV_DELAY)."""
+        self.position = Measurement("vision_position", 0, selecting(es.POS, es.POS + 1))
+        self.height = Measurement("vision_height", 3, selecting(es.POS + 2))
+        self.velocity = Measurement("vision_velocity", 0, selecting(es.VEL, es.VEL + 1, es.VEL + 2))
+        self.yaw = Measurement("vision_heading", 2, np.zeros((1, es.N_STATES)))
+        self.fused = Control(0)
+        """What is being fused."""
+        self.is_north_known = True
+        """Whether the heading is that of the globe: not where it is of vision's own frame."""
+        self._newest: Odometry | None = None
+        self._first_us = 0
+        """When the first came."""
+        self._has_noise: bool | None = None
+        """Whether no two are the same at rest, either; None = not known yet."""
+        self._previous: Odometry | None = None
+        """The newest that was good."""
+        self._previous_us = 0
+        self._frame = (1.0, 0.0, 0.0, 0.0)
+        """Turns vision's frame into the filter's (quaternion)."""
+        self._is_frame_known = False
+        self._resets_left = RESETS
+
+    def take(self, odometry: Odometry, now_us: int, *, gps: bool, flying: bool) -> None:
+        """Fuse what of it is asked for.
+
+        Args:
+            odometry: As it came.
+            now_us: Now.
+            gps: Whether GPS is being fused.
+            flying: Whether the vehicle is in the air.
+        """
+        asked = Control(int(self._value("EKF2_EV_CTRL")) & 15)
+        if self._is_stuck(odometry, now_us, flying=flying):
+            return
+        self.horizon.assume(self._value("EKF2_EV_DELAY"))
+        self.fused &= asked
+        previous, wanted = self._previous, self._value("EKF2_EV_QMIN")
+        good = wanted <= 0 or odometry.quality >= wanted
+        begins = good and previous is not None and now_us - self._previous_us < LONGEST_INTERVAL_US
+        jumped = previous is not None and odometry.reset_counter != previous.reset_counter
+        self._learn_frame(odometry, anew=jumped)
+        if asked & Control.YAW:
+            self._take_yaw(odometry, begins=begins, good=good, jumped=jumped, gps=gps)
+        if asked & Control.VELOCITY:
+            self._take_velocity(odometry, begins=begins, good=good)
+        if asked & Control.HORIZONTAL and not gps:
+            self._take_position(
+                odometry, now_us, begins=begins, good=good, jumped=jumped, flying=flying
+            )
+        elif gps:
+            self.fused &= ~Control.HORIZONTAL
+        if asked & Control.VERTICAL and self._value("EKF2_HGT_REF") == HEIGHT_BY_VISION:
+            self._take_height(odometry, begins=begins, good=good, jumped=jumped)
+        else:
+            self.fused &= ~Control.VERTICAL
+        if good:
+            self._previous, self._previous_us = odometry, now_us
+
+    def _is_stuck(self, odometry: Odometry, now_us: int, *, flying: bool) -> bool:
+        """Return whether it repeats itself where nothing is measured twice.
+
+        In the air nothing is, and at rest nothing by what has noise: that is learnt in its first
+        second.
+        """
+        before = self._newest
+        repeats = before is not None and all(
+            (a is None and b is None) or (a is not None and b is not None and np.array_equal(a, b))
+            for a, b in zip(odometry[:3], before[:3], strict=True)
+        )
+        self._newest = odometry
+        if before is None:
+            self._first_us = now_us
+        elif self._has_noise is None and (repeats or now_us - self._first_us >= LEARN_US):
+            self._has_noise = not repeats
+        return repeats and (flying or bool(self._has_noise))
+
+    def look(self, now_us: int) -> None:
+        """Stop fusing where nothing comes any more."""
+        if now_us - self._previous_us > SILENT_US:
+            self.fused, self._previous, self._is_frame_known = Control(0), None, False
+
+    # --- heading
+
+    def _take_yaw(
+        self, odometry: Odometry, *, begins: bool, good: bool, jumped: bool, gps: bool
+    ) -> None:
+        quaternion, active = odometry.quaternion, bool(self.fused & Control.YAW)
+        in_ned = odometry.pose_frame == "ned"
+        # A heading of vision's own frame would turn what GPS measures.
+        if quaternion is None or (gps and not in_ned) or not (active or begins):
+            self.fused &= ~Control.YAW
+            return
+        yaw = yaw_of(tuple(quaternion.tolist()))
+        # PX4 takes EKF2_EVA_NOISE [rad] for the variance here.
+        noise = self._value("EKF2_EVA_NOISE")
+        told = self._variance(odometry.orientation_variance, noise).item(2)
+        variance = max(told, noise, LEAST_VARIANCE)
+        if (active and jumped and good) or (not active and not (in_ned and self.is_north_known)):
+            self._filter.restart(turn_to(self._state, self._filter.covariance, yaw, variance))
+            self.fused |= Control.YAW
+            self.is_north_known = in_ned
+        elif good:
+            m, q = self.yaw, es.attitude(self._state)
+            m.innovation[0] = math.remainder(yaw - yaw_of(q), 2.0 * math.pi)
+            m.variance[0] = variance
+            m.h[0, es.ATT : es.GYRO] = yaw_by_turn(q)
+            self._fuse(m)
+            self.fused |= Control.YAW
+
+    # --- velocity
+
+    def _take_velocity(self, odometry: Odometry, *, begins: bool, good: bool) -> None:
+        measured, active = odometry.velocity, bool(self.fused & Control.VELOCITY)
+        if measured is None or not (active or begins):
+            self.fused &= ~Control.VELOCITY
+            return
+        if not good:
+            return
+        m, frame = self.velocity, odometry.velocity_frame
+        m.h[:, es.ATT : es.GYRO] = 0.0
+        if frame == "body":
+            body = quat_to_matrix(self._state[es.Q : es.RATES])
+            # An error of the attitude turns what was measured in body axes.
+            m.h[:, es.ATT : es.GYRO] = body @ _cross(measured)
+            measured = body @ measured
+        elif frame == "frd" and not self.fused & Control.YAW:
+            measured = self._into_own_frame(measured)
+        noise = self._value("EKF2_EVV_NOISE")
+        m.innovation[:] = measured - self._then()[3:]
+        m.variance[:] = self._variance(odometry.velocity_variance, noise)
+        m.variance *= self._judge(m.innovation.copy(), m.variance)
+        # The filter may have been restarted.
+        m.innovation[:] = measured - self._then()[3:]
+        self._fuse(m)
+        self.fused |= Control.VELOCITY
+
+    # --- position
+
+    def _take_position(
+        self,
+        odometry: Odometry,
+        now_us: int,
+        *,
+        begins: bool,
+        good: bool,
+        jumped: bool,
+        flying: bool,
+    ) -> None:
+        active = bool(self.fused & Control.HORIZONTAL)
+        needs_north = odometry.pose_frame == "ned" and not self.is_north_known
+        if odometry.position is None or needs_north or not (active or begins):
+            self.fused &= ~Control.HORIZONTAL
+            return
+        measured, variance = self._place(odometry.position, odometry)
+        m = self.position
+        overdue = m.fused_us is not None and now_us - m.fused_us > self._value("EKF2_NOAID_TOUT")
+        if not active or (jumped and good) or (overdue and good and self._resets_left > 0):
+            self._put(measured, variance)
+            m.fused_us = now_us
+            if not active:
+                self._resets_left = RESETS
+            elif overdue and flying:
+                self._resets_left -= 1
+            self.fused |= Control.HORIZONTAL
+        elif overdue:
+            self.fused &= ~Control.HORIZONTAL
+        elif good:
+            m.innovation[:] = measured[:2] - self._then()[:2]
+            m.variance[:] = variance[:2]
+            self._fuse(m)
+
+    def _take_height(self, odometry: Odometry, *, begins: bool, good: bool, jumped: bool) -> None:
+        active = bool(self.fused & Control.VERTICAL)
+        if odometry.position is None or not (active or begins):
+            self.fused &= ~Control.VERTICAL
+            return
+        measured, variance = self._place(odometry.position, odometry)
+        if not active or (jumped and good):
+            self._put_height(measured.item(2), variance.item(2))
+            self.fused |= Control.VERTICAL
+        elif good:
+            m = self.height
+            m.innovation[0] = measured.item(2) - self._then().item(2)
+            m.variance[0] = variance.item(2)
+            self._fuse(m)
+
+    def _place(self, position: Vector, odometry: Odometry) -> tuple[Vector, Vector]:
+        """Return the position of odometry and its variance (3,), in the filter's frame."""
+        noise = self._value("EKF2_EVP_NOISE")
+        variance = np.maximum(self._variance(odometry.position_variance, noise), LEAST_VARIANCE)
+        if odometry.pose_frame == "frd" and not self.fused & Control.YAW:
+            turned = self._variance(odometry.orientation_variance, self._value("EKF2_EVA_NOISE"))
+            position, variance = self._into_own_frame(position), np.maximum(variance, turned.max())
+        return position, variance
+
+    def _variance(self, told: Vector, noise: float) -> Vector:
+        """Return the variance (3,): what was told, at least the parameter's (EKF2_EV_NOISE_MD)."""
+        if self._value("EKF2_EV_NOISE_MD") == 0 and np.isfinite(told).all():
+            return np.maximum(told, noise**2)
+        return np.full(3, noise**2)
+
+    def _then(self) -> Vector:
+        """Return position and velocity (6,) when odometry of now was measured."""
+        state, horizon = self._state, self.horizon
+        return horizon.seen_from(state) if horizon.is_past else state[es.P : es.Q]
+
+    # --- jumps
+
+    def _put(self, place: Vector, variance: Vector) -> None:
+        """Put the horizontal position elsewhere; nothing else is known of it."""
+        moved = place[:2] - self._then()[:2]
+        self._state[es.P : es.P + 2] += moved
+        covariance = self._filter.covariance.copy()
+        for i in range(2):
+            _forget(covariance, es.POS + i, variance.item(i))
+        self._filter.restart(covariance)
+
+    def _put_height(self, down: float, variance: float) -> None:
+        """Put the height elsewhere; the barometer's offset goes with it."""
+        moved = down - self._then().item(2)
+        self._state[es.P + 2] += moved
+        self._state[es.BARO_OFFSET] += moved
+        covariance = self._filter.covariance.copy()
+        _forget(covariance, es.POS + 2, variance)
+        self._filter.restart(covariance)
+
+    # --- vision's frame
+
+    def _learn_frame(self, odometry: Odometry, *, anew: bool) -> None:
+        if odometry.quaternion is None:
+            return
+        seen = tuple(odometry.quaternion.tolist())
+        turn = multiply(es.attitude(self._state), conjugate(seen))
+        if anew or not self._is_frame_known:
+            self._frame, self._is_frame_known = normalize(turn), True
+            return
+        sign = 1.0 if sum(a * b for a, b in zip(turn, self._frame, strict=True)) >= 0.0 else -1.0
+        w, x, y, z = (
+            a + FRAME_SHARE * (sign * b - a) for a, b in zip(self._frame, turn, strict=True)
+        )
+        self._frame = normalize((w, x, y, z))
+
+    def _into_own_frame(self, vector: Vector) -> Vector:
+        turned: Vector = quat_to_matrix(np.array(self._frame)) @ vector
+        return turned
+
+
+def yaw_by_turn(q: tuple[float, float, float, float]) -> tuple[float, float, float]:
+    """Return how the yaw changes by a turn about each body axis (Euler's kinematic equations)."""
+    w, x, y, z = q
+    roll = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+    pitch = math.asin(min(1.0, max(-1.0, 2.0 * (w * y - z * x))))
+    return 0.0, math.sin(roll) / math.cos(pitch), math.cos(roll) / math.cos(pitch)
+
+
+def _cross(v: Vector) -> Vector:
+    """Return the matrix [v]x."""
+    x, y, z = v.tolist()
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def _forget(covariance: Vector, index: int, variance: float) -> None:
+    """Set a state's variance, and its correlations to none, in place."""
+    covariance[index, :] = covariance[:, index] = 0.0
+    covariance[index, index] = variance
