@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mavsdk.plugins.mocap import mocap
 from pymavlink.dialects.v20 import common as dialect
 from scipy.spatial.transform import Rotation
 
@@ -145,6 +146,47 @@ def test_vision_position_estimate() -> None:
     assert (found * expected.inv()).magnitude() < 1e-6
     np.testing.assert_allclose(seen.position_variance, DIAGONAL[:3])
     np.testing.assert_allclose(seen.orientation_variance, DIAGONAL[3:])
+
+
+def test_mavsdk_s_mocap_plugin_is_understood() -> None:
+    """What a program on the drone sends by MAVSDK is what the estimator is given."""
+    unknown = mocap.Covariance([NAN])
+    with mavlink_clients.mavsdk_over_memory() as (companion, pacer):
+        autopilot = pacer.bench.autopilot
+        plugin = companion.plugin(mocap.Mocap)
+        plugin.set_odometry(
+            mocap.Odometry(
+                1,
+                mocap.Odometry.MavFrame.LOCAL_FRD,
+                mocap.PositionBody(1.0, 2.0, -3.0),
+                mocap.Quaternion(1.0, 0.0, 0.0, 0.0),
+                mocap.SpeedBody(0.5, -0.25, 0.125),
+                mocap.AngularVelocityBody(0.0, 0.0, 0.0),
+                unknown,
+                unknown,
+                4,
+                mocap.Odometry.MavEstimatorType.VIO,
+                90,
+            )
+        )
+        plugin.set_vision_position_estimate(
+            mocap.VisionPositionEstimate(
+                1, mocap.PositionBody(4.0, 5.0, -6.0), mocap.AngleBody(0.0, 0.0, 1.5), unknown, 0
+            )
+        )
+        mavlink_clients.wait_for(lambda: len(autopilot.odometry) == 2)
+    odometry, estimate = autopilot.odometry
+    assert odometry.position is not None and odometry.velocity is not None
+    assert estimate.position is not None and estimate.quaternion is not None
+    assert (odometry.pose_frame, odometry.velocity_frame) == ("frd", "body")
+    np.testing.assert_allclose(odometry.position, [1.0, 2.0, -3.0])
+    np.testing.assert_allclose(odometry.velocity, [0.5, -0.25, 0.125])
+    assert np.isnan(odometry.position_variance).any()
+    assert estimate.pose_frame == "ned"
+    np.testing.assert_allclose(estimate.position, [4.0, 5.0, -6.0])
+    np.testing.assert_allclose(
+        estimate.quaternion, [math.cos(0.75), 0, 0, math.sin(0.75)], atol=1e-6
+    )
 
 
 def test_what_px4_is_told_is_read_as_it_was_meant() -> None:
