@@ -24,14 +24,13 @@ from airl_mav.vehicle.atmosphere import altitude_m
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.alignment import Alignment
 from firmware_sim.autopilot.autopilot_state import Estimate
-from firmware_sim.autopilot.consistency import Compass, Consistency, Restart
-from firmware_sim.autopilot.emergency_yaw import EmergencyYaw, turn_to
 from firmware_sim.autopilot.error_filter import NewFilter
 from firmware_sim.autopilot.external_vision import Control, ExternalVision
 from firmware_sim.autopilot.filter_kernel import KernelFilter
 from firmware_sim.autopilot.fusion_horizon import FusionHorizon
 from firmware_sim.autopilot.magnetic_field import FieldCheck
 from firmware_sim.autopilot.measurement import Measurement, selecting
+from firmware_sim.autopilot.recovery import Moment, Recovery
 from firmware_sim.autopilot.yaw_estimator import YawEstimator
 from firmware_sim.interfaces import GpsFix, Odometry, SensorSample
 
@@ -47,9 +46,6 @@ _NO_COMPASS = 5
 
 GPS_GONE_US = 1_000_000
 """GPS that was not fused for so long no longer aids the filter (EKF2: its data are late)."""
-
-PROBATION_US = 10 * US_PER_S
-"""Inertial sensors that were wrong are doubted for so long (EKF2: BADACC_PROBATION) [µs]."""
 
 _JUDGED_EVERY_US = US_PER_S // 10
 """What `consistency` counts are samples of a usual GPS."""
@@ -94,21 +90,15 @@ class Estimator:
         self._gps_vertical = Measurement("gps_vertical", 3, selecting(es.POS + 2, es.VEL + 2))
         self._baro = Measurement("baro", 1, selecting(es.BARO) - selecting(es.POS + 2))
         self._heading = Measurement("heading", 2, np.zeros((1, es.N_STATES)))
-        self.consistency = Consistency()
-        """Sees inertial sensors that have gone wrong."""
-        self.compass = Compass()
-        """Whether the compass is believed."""
         self._horizon = FusionHorizon()
         self.yaw = YawEstimator()
         """The heading without a compass."""
+        self.recovery = Recovery(self.state, self.filter, self.yaw)
+        """What is done about inertial sensors and a heading that have gone wrong."""
         self.vision = ExternalVision(value, self.state, self.filter, self._fuse, self._judge)
         """What something else has estimated of the vehicle's pose."""
         self.flying = False
         """Whether the vehicle is in the air; set by whoever knows."""
-        self.emergency = EmergencyYaw()
-        """When it is taken over."""
-        self._biases_before = self.state[es.GYRO_BIAS : es.BARO_OFFSET].copy()
-        """Of gyro and accelerometer (6,), before these were doubted."""
         self._field: Vector | None = None
         """The newest that the compass has measured (3,) FRD [gauss]; before alignment the mean."""
 
@@ -216,11 +206,6 @@ class Estimator:
         fused = self._gps_horizontal.fused_us
         return fused is not None and now_us - fused <= GPS_GONE_US
 
-    def doubts_inertial(self, now_us: int) -> bool:
-        """Return whether inertial data disagreed with the GPS lately."""
-        restarted = self.consistency.restarted_us
-        return restarted is not None and now_us - restarted < PROBATION_US
-
     @property
     def field_disturbed(self) -> bool:
         """Whether the compass measures something else than the earth's field, by EKF2_MAG_CHECK."""
@@ -297,11 +282,12 @@ class Estimator:
         r_p, r_v = value("EKF2_GPS_P_NOISE") ** 2, value("EKF2_GPS_V_NOISE") ** 2
         self._horizon.assume(value("EKF2_GPS_DELAY"))
         self._observe_yaw(fix.velocity_ned, math.sqrt(r_v))
-        excess = self.consistency.velocity_excess
-        self._answer(self._check_velocity(fix.velocity_ned - self._then()[3:], r_v))
+        recovery, now = self.recovery, self._now
+        excess = recovery.consistency.velocity_excess
+        recovery.take_velocity(fix.velocity_ned - self._then()[3:], r_v, now)
         r_v *= excess
-        if self._heading_is_due and self._suspects_heading:
-            self._reset_heading(measured, fix.velocity_ned, r_p, r_v)
+        if recovery.heading_is_wrong(now):
+            recovery.turn(measured, fix.velocity_ned, self._then().copy(), r_p, r_v, now)
         m, then = self._gps_horizontal, self._then()
         m.innovation[:2] = measured[:2] - then[:2]
         m.innovation[2:] = fix.velocity_ned[:2] - then[3:5]
@@ -342,82 +328,22 @@ class Estimator:
             self.state, field, MAGNETIC_DECLINATION, _HEADING_BY_TURN_NED, m.innovation, m.h
         )
         innovation = m.innovation.item(0)
-        if not (observable and self.compass.admits(innovation)):
+        if not (observable and self.recovery.compass.admits(innovation)):
             return
         m.variance[0] = self._value("EKF2_HEAD_NOISE") ** 2
         self._fuse(m)
-        ratio = self.state.item(m.slot)
-        self.compass.tested(innovation, ratio, self._time_us)
-        deviations = math.copysign(es.GATE * ratio, innovation)
-        self._answer(self.consistency.heading(deviations, self._time_us, within=ratio <= 1.0))
+        self.recovery.take_heading(innovation, self.state.item(m.slot), self._now)
 
     # --- inertial sensors that have gone wrong
+
+    @property
+    def _now(self) -> Moment:
+        return Moment(self._time_us, self.flying, self._gps_horizontal.fused_us)
 
     def _judge(self, innovation: Vector, variance: Vector) -> float:
         """Hold a velocity of external vision against the inertial sensors, as often as GPS's."""
         by_gps = self._uses_gps and self.fuses_gps(self._time_us)
         if not by_gps and self._time_us - self._judged_us >= _JUDGED_EVERY_US:
             self._judged_us = self._time_us
-            self._answer(self._check_velocity(innovation, variance))
-        return self.consistency.velocity_excess
-
-    def _check_velocity(self, innovation: Vector, variance: float | Vector) -> Restart | None:
-        """Return what a measured velocity of some variance says to restart the filter with."""
-        sigma = np.sqrt(self.filter.covariance.diagonal()[es.VEL : es.ATT] + variance)
-        acceleration = self.state[es.ACCELERATION : es.SIGMA]
-        return self.consistency.velocity(innovation, sigma, acceleration, self._time_us)
-
-    @property
-    def _heading_is_due(self) -> bool:
-        return self.emergency.is_due(self._time_us, self.yaw, self._gps_horizontal.fused_us)
-
-    @property
-    def _suspects_heading(self) -> bool:
-        return self.flying and self.emergency.is_suspected(self.state, self.yaw)
-
-    def _answer(self, restart: Restart | None) -> None:
-        """Restart the filter, unless the heading is given up for the same reason."""
-        if restart is None:
-            return
-        if self._suspects_heading:
-            self.emergency.doubt(self._time_us)
-            if self._heading_is_due:
-                return
-        self._restart(restart)
-
-    def _reset_heading(self, place: Vector, velocity: Vector, r_p: float, r_v: float) -> None:
-        """Take over the yaw estimator's heading and the GPS's motion, and give up the compass.
-
-        What a restart has let the filter learn meanwhile, in tilt and biases, goes with it.
-        """
-        state, then = self.state, self._then().copy()
-        if self.doubts_inertial(self._time_us):
-            # The inertial sensors were doubted for what the heading did.
-            state[es.GYRO_BIAS : es.BARO_OFFSET] = self._biases_before
-            state[es.Q : es.RATES] = self.yaw.attitude
-        covariance = turn_to(state, self.filter.covariance, self.yaw.yaw, self.yaw.variance)
-        state[es.P : es.P + 2] += place[:2] - then[:2]
-        state[es.V : es.Q] += velocity - then[3:]
-        for i in range(2):
-            covariance[es.POS + i, es.POS + i] = r_p
-        for i in range(3):
-            covariance[es.VEL + i, es.VEL + i] = r_v
-        self.filter.restart(covariance)
-        self.compass.fail()
-        self.emergency.resets += 1
-
-    def _restart(self, restart: Restart) -> None:
-        """Let the filter learn anew what inertial sensors make wrong."""
-        if not self.doubts_inertial(self._time_us):
-            self._biases_before = self.state[es.GYRO_BIAS : es.BARO_OFFSET].copy()
-        self.consistency.restarted(self._time_us)
-        variances = self.filter.covariance.diagonal().copy()
-        for first, sigma in (
-            (es.VEL, restart.velocity_m_s),
-            (es.ATT, restart.attitude_rad),
-            (es.GYRO, restart.gyro_bias_rad_s),
-            (es.ACC, restart.accel_bias_m_s2),
-        ):
-            block = variances[first : first + 3]
-            np.maximum(block, sigma**2, out=block)
-        self.filter.restart(np.diag(variances))
+            self.recovery.take_velocity(innovation, variance, self._now)
+        return self.recovery.consistency.velocity_excess

@@ -372,7 +372,7 @@ def wander(rig: Rig, seconds: float, seed: int) -> Log:
         p = estimator.filter.covariance
         blocks = [p[i : i + 3, i : i + 3] for i in range(0, 15, 3)]
         nees.append([x @ np.linalg.solve(b, x) / 3 for x, b in zip(errors, blocks, strict=True)])
-    return Log(log, np.array(nees), estimator.consistency.restarts)
+    return Log(log, np.array(nees), estimator.recovery.consistency.restarts)
 
 
 SEEDS = (0, 1)

@@ -323,7 +323,7 @@ def test_a_compass_that_is_wrong_from_the_start_is_survived(bias: str) -> None:
         rig.take_off(5.0, settle_s=0.0)
         rig.go_offboard(velocity_setpoint(2.0, 0.0, 0.0))
         rig.run(4.0)
-        assert rig.ap.estimator.emergency.resets == 1
+        assert rig.ap.estimator.recovery.emergency.resets == 1
         assert abs(heading_error_deg(rig)) < 10.0
         assert rig.said("Compass needs calibration - Land now!") > 0.0
         assert rig.truth.velocity[0] > 1.5
@@ -346,7 +346,10 @@ def test_a_heading_that_was_taken_for_biases_takes_them_along() -> None:
     with flight(310, faults=("mag bias -0.4,0,0gauss",)) as rig:
         rig.take_off(5.0, settle_s=3.0)
         estimator = rig.ap.estimator
-        assert (estimator.consistency.restarts, estimator.emergency.resets) == (1, 1)
+        assert (estimator.recovery.consistency.restarts, estimator.recovery.emergency.resets) == (
+            1,
+            1,
+        )
         assert abs(heading_error_deg(rig)) < 10.0
         assert np.abs(estimator.state[es.GYRO_BIAS : es.ACCEL_BIAS]).max() < math.radians(1.0)
         assert np.abs(estimator.state[es.ACCEL_BIAS : es.BARO_OFFSET]).max() < 0.3
@@ -360,5 +363,5 @@ def test_a_healthy_compass_is_never_doubted() -> None:
         rig.stream(velocity_setpoint(-4.0, 2.0, 0.0, yaw=2.0))
         rig.run(3.0)
         estimator = rig.ap.estimator
-        assert estimator.emergency.resets == 0
+        assert estimator.recovery.emergency.resets == 0
         assert estimator.yaw.variance < math.radians(15.0) ** 2, "it was asked, and agreed"

@@ -229,13 +229,13 @@ class Watch:
                 text = f"External vision fusion {'started' if seen else 'stopped'}"
                 texts.append(Message(Severity.INFO if seen else Severity.WARNING, text))
         estimator = self._estimator
-        if estimator.consistency.restarts != self._restarts:
-            self._restarts = estimator.consistency.restarts
+        if estimator.recovery.consistency.restarts != self._restarts:
+            self._restarts = estimator.recovery.consistency.restarts
             other = "GNSS" if fused else "vision"
             text = f"Estimator biases reset: IMU and {other} disagree"
             texts.append(Message(Severity.WARNING, text))
-        if estimator.compass.given_up is not self._compass_given_up:
-            given_up = self._compass_given_up = estimator.compass.given_up
+        if estimator.recovery.compass.given_up is not self._compass_given_up:
+            given_up = self._compass_given_up = estimator.recovery.compass.given_up
             if given_up and phase >= _GROUND:
                 text = "Compass needs calibration - Land now!"
                 texts.append(Message(Severity.CRITICAL, text))

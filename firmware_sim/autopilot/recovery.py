@@ -1,0 +1,133 @@
+"""What the estimator does about inertial sensors and a heading that have gone wrong.
+
+`consistency` tells them from noise, `emergency_yaw` which of them it is; here the filter is told to
+learn anew, or is turned to the yaw estimator's heading.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from airl_mav.core.constants import US_PER_S
+from airl_mav.core.frames import Vector
+from firmware_sim.autopilot import error_state as es
+from firmware_sim.autopilot.consistency import Compass, Consistency, Restart
+from firmware_sim.autopilot.emergency_yaw import EmergencyYaw, turn_to
+from firmware_sim.autopilot.error_filter import ErrorFilter
+from firmware_sim.autopilot.yaw_estimator import YawEstimator
+
+PROBATION_US = 10 * US_PER_S
+"""Inertial sensors that were wrong are doubted for so long (EKF2: BADACC_PROBATION) [µs]."""
+
+
+class Moment(NamedTuple):
+    """When something is decided."""
+
+    time_us: int
+    flying: bool
+    """Whether the vehicle is in the air."""
+    gps_us: int | None
+    """When GPS was last within the gate; None = never."""
+
+
+class Recovery:
+    """Watches velocities and headings, and restarts the filter with what they say is wrong."""
+
+    def __init__(self, state: Vector, error_filter: ErrorFilter, yaw: YawEstimator) -> None:
+        """Take the nominal state and its filter, which are changed, and the yaw estimator."""
+        self._state, self._filter, self._yaw = state, error_filter, yaw
+        self.consistency = Consistency()
+        """Sees inertial sensors that have gone wrong."""
+        self.compass = Compass()
+        """Whether the compass is believed."""
+        self.emergency = EmergencyYaw()
+        """When the yaw estimator's heading is taken over."""
+        self._biases_before = state[es.GYRO_BIAS : es.BARO_OFFSET].copy()
+        """Of gyro and accelerometer (6,), before these were doubted."""
+
+    def doubts_inertial(self, now_us: int) -> bool:
+        """Return whether inertial data disagreed with what measures velocity lately."""
+        restarted = self.consistency.restarted_us
+        return restarted is not None and now_us - restarted < PROBATION_US
+
+    def take_velocity(self, innovation: Vector, variance: float | Vector, now: Moment) -> None:
+        """Take a velocity that was measured with some variance: its innovation (3,) NED."""
+        sigma = np.sqrt(self._filter.covariance.diagonal()[es.VEL : es.ATT] + variance)
+        acceleration = self._state[es.ACCELERATION : es.SIGMA]
+        self._answer(self.consistency.velocity(innovation, sigma, acceleration, now.time_us), now)
+
+    def take_heading(self, innovation: float, ratio: float, now: Moment) -> None:
+        """Take the innovation of a heading and its test ratio: beyond 1 it was refused."""
+        self.compass.tested(innovation, ratio, now.time_us)
+        deviations = math.copysign(es.GATE * ratio, innovation)
+        self._answer(self.consistency.heading(deviations, now.time_us, within=ratio <= 1.0), now)
+
+    def heading_is_wrong(self, now: Moment) -> bool:
+        """Return whether the heading is given up now."""
+        return self._is_due(now) and self._is_suspected(now)
+
+    def turn(
+        self, place: Vector, velocity: Vector, then: Vector, r_p: float, r_v: float, now: Moment
+    ) -> None:
+        """Take over the yaw estimator's heading and the GPS's motion, and give up the compass.
+
+        What a restart has let the filter learn meanwhile, in tilt and biases, goes with it.
+
+        Args:
+            place: Measured position (3,) NED [m].
+            velocity: Measured (3,) NED [m/s].
+            then: Position and velocity (6,) by the filter when they were measured.
+            r_p: Variance of the place [m²].
+            r_v: Variance of the velocity [m²/s²].
+            now: When.
+        """
+        state = self._state
+        if self.doubts_inertial(now.time_us):
+            # The inertial sensors were doubted for what the heading did.
+            state[es.GYRO_BIAS : es.BARO_OFFSET] = self._biases_before
+            state[es.Q : es.RATES] = self._yaw.attitude
+        covariance = turn_to(state, self._filter.covariance, self._yaw.yaw, self._yaw.variance)
+        state[es.P : es.P + 2] += place[:2] - then[:2]
+        state[es.V : es.Q] += velocity - then[3:]
+        for i in range(2):
+            covariance[es.POS + i, es.POS + i] = r_p
+        for i in range(3):
+            covariance[es.VEL + i, es.VEL + i] = r_v
+        self._filter.restart(covariance)
+        self.compass.fail()
+        self.emergency.resets += 1
+
+    def _is_due(self, now: Moment) -> bool:
+        return self.emergency.is_due(now.time_us, self._yaw, now.gps_us)
+
+    def _is_suspected(self, now: Moment) -> bool:
+        return now.flying and self.emergency.is_suspected(self._state, self._yaw)
+
+    def _answer(self, restart: Restart | None, now: Moment) -> None:
+        """Restart the filter, unless the heading is given up for the same reason."""
+        if restart is None:
+            return
+        if self._is_suspected(now):
+            self.emergency.doubt(now.time_us)
+            if self._is_due(now):
+                return
+        self._restart(restart, now.time_us)
+
+    def _restart(self, restart: Restart, time_us: int) -> None:
+        """Let the filter learn anew what inertial sensors make wrong."""
+        if not self.doubts_inertial(time_us):
+            self._biases_before = self._state[es.GYRO_BIAS : es.BARO_OFFSET].copy()
+        self.consistency.restarted(time_us)
+        variances = self._filter.covariance.diagonal().copy()
+        for first, sigma in (
+            (es.VEL, restart.velocity_m_s),
+            (es.ATT, restart.attitude_rad),
+            (es.GYRO, restart.gyro_bias_rad_s),
+            (es.ACC, restart.accel_bias_m_s2),
+        ):
+            block = variances[first : first + 3]
+            np.maximum(block, sigma**2, out=block)
+        self._filter.restart(np.diag(variances))
