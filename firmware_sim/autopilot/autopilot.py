@@ -47,7 +47,13 @@ from firmware_sim.autopilot.navigation.whereabouts import Whereabouts
 from firmware_sim.autopilot.newest_sensors import NewestSensors
 from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.autopilot.port import Failures, LogStore, NoLogs
-from firmware_sim.autopilot.requests import FollowedTarget, LandingTarget, Place, Request
+from firmware_sim.autopilot.requests import (
+    FollowedTarget,
+    LandingTarget,
+    Obstacles,
+    Place,
+    Request,
+)
 from firmware_sim.autopilot.snapshot import Parts, snapshot
 from firmware_sim.interfaces import ActuatorControls, Odometry, SensorSample, Truth
 
@@ -402,6 +408,10 @@ class BuiltinAutopilot:
         """Hand over a pose that something else has estimated."""
         self.estimator.see(odometry)
         self._snapshot = None
+
+    def see_obstacles(self, obstacles: Obstacles) -> None:
+        """Hand over how far obstacles are."""
+        self._guidance.context.obstacles = obstacles
 
     def follow(self, target: FollowedTarget) -> None:
         """Hand over where the target is that Follow follows."""

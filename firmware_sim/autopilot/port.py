@@ -14,7 +14,7 @@ from firmware_sim.autopilot.autopilot_state import AutopilotState, Message, Mode
 from firmware_sim.autopilot.events.definition import Event
 from firmware_sim.autopilot.manual_control import Source, Sticks
 from firmware_sim.autopilot.navigation.plan import Plans
-from firmware_sim.autopilot.requests import FollowedTarget, LandingTarget, Request
+from firmware_sim.autopilot.requests import FollowedTarget, LandingTarget, Obstacles, Request
 from firmware_sim.interfaces import Odometry, SensorSample
 
 
@@ -242,6 +242,10 @@ class AutopilotPort(Protocol):
 
     def see(self, odometry: Odometry) -> None:
         """Hand over a pose that something else has estimated, received now."""
+        ...
+
+    def see_obstacles(self, obstacles: Obstacles) -> None:
+        """Hand over how far obstacles are."""
         ...
 
     def follow(self, target: FollowedTarget) -> None:

@@ -64,6 +64,24 @@ class LandingTarget(NamedTuple):
     """When it was heard, in simulated time."""
 
 
+class Obstacles(NamedTuple):
+    """How far the nearest obstacle is in bins around the vehicle, as OBSTACLE_DISTANCE has it."""
+
+    distances_cm: tuple[int, ...]
+    """Clockwise; beyond the range: none there; 65535: not known."""
+    increment_deg: float
+    """Width of a bin."""
+    offset_deg: float
+    """Direction of the middle of the first."""
+    nearest_cm: int
+    """Range of the sensor."""
+    farthest_cm: int
+    in_world: bool
+    """Whether directions are counted from north, not from straight ahead."""
+    time_us: int
+    """When it was heard, in simulated time."""
+
+
 class FollowedTarget(NamedTuple):
     """What Follow follows."""
 

@@ -33,7 +33,7 @@ from firmware_sim.autopilot.manual_control import Source, Sticks
 from firmware_sim.autopilot.navigation.plan import Plans
 from firmware_sim.autopilot.navigation.progress import progress
 from firmware_sim.autopilot.port import Failures, LogStore, NoLogs, ParameterValue
-from firmware_sim.autopilot.requests import FollowedTarget, LandingTarget, Request
+from firmware_sim.autopilot.requests import FollowedTarget, LandingTarget, Obstacles, Request
 from firmware_sim.interfaces import BatterySample, GpsFix, Odometry, SensorSample
 
 ORIGIN = Geodetic(47.397743, 8.545594, 489.4)
@@ -127,6 +127,7 @@ class KinematicAutopilot:
         self.gyro = np.zeros(3)
         self.setpoints: list[tuple[Setpoint, int]] = []
         self.odometry: list[Odometry] = []
+        self.obstacles: list[Obstacles] = []
         self.gcs_heartbeats: list[int] = []
         self.takeoffs: list[float | None] = []
         self.takeoff_place: tuple[float, float] | None = None
@@ -241,6 +242,9 @@ class KinematicAutopilot:
 
     def manual_control(self, sticks: Sticks, source: Source, time_us: int) -> None:
         self.sticks.append((sticks, source, time_us))
+
+    def see_obstacles(self, obstacles: Obstacles) -> None:
+        self.obstacles.append(obstacles)
 
     def see(self, odometry: Odometry) -> None:
         self.odometry.append(odometry)

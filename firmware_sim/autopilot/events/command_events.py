@@ -83,6 +83,12 @@ LANDING_TARGET_FRAME = Definition(
     Level.ERROR,
 )
 
+OBSTACLE_FRAME = Definition(
+    "col_prev_unsup_frame",
+    "Obstacle message received in unsupported frame {1}",
+    arguments("uint8_t frame"),
+    Level.ERROR,
+)
 ODOMETRY_ESTIMATOR = Definition(
     "mavlink_rcv_odom_unsup_estimator_type",
     "ODOMETRY: unsupported estimator_type {1}",

@@ -16,7 +16,7 @@ from firmware_sim.autopilot.climb import Climb
 from firmware_sim.autopilot.error_state import RATES, P, Q
 from firmware_sim.autopilot.manual_control import Sticks
 from firmware_sim.autopilot.navigation.triplet import STANDING, Triplet
-from firmware_sim.autopilot.requests import FollowedTarget, LandingTarget, Place, Request
+from firmware_sim.autopilot.requests import FollowedTarget, LandingTarget, Obstacles, Place, Request
 from firmware_sim.autopilot.travel import Travel
 
 NAN = math.nan
@@ -64,6 +64,8 @@ class FlightContext:
     """What Follow follows."""
     landing_target: LandingTarget | None = None
     """What a precision landing lands on, as it was reported last."""
+    obstacles: Obstacles | None = None
+    """Where obstacles are, as was told last."""
     orbit: OrbitStatus | None = None
     """The circle that was flown last."""
 

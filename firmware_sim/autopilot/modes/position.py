@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from airl_mav.core.frames import Vector
-from firmware_sim.autopilot.error_state import P, V
+from functools import partial
+
+from airl_mav.core.frames import Vector, quat_yaw
+from firmware_sim.autopilot.error_state import RATES, P, Q, V
 from firmware_sim.autopilot.manual_control import Sticks
+from firmware_sim.autopilot.modes.collision_prevention import CollisionPrevention
 from firmware_sim.autopilot.modes.interface import FlightContext, triple
 from firmware_sim.autopilot.modes.piloted import Piloted
 from firmware_sim.autopilot.modes.stick_motion import AxisDemand, HorizontalStick
@@ -17,15 +20,33 @@ class Position(Piloted):
     def __init__(self, context: FlightContext, /) -> None:
         super().__init__(context)
         self._horizontal = HorizontalStick(context.value)
+        self._prevention = CollisionPrevention(context.value)
 
     def enter(self, state: Vector, request: Request | None, /) -> None:
         """Begin with the present motion."""
         super().enter(state, request)
         north, east, _ = triple(state, V)
         self._horizontal.restart((north, east))
+        self._prevention.rest()
 
     def _steer(
         self, sticks: Sticks, heading: float, state: Vector, dt: float, /
     ) -> tuple[AxisDemand, AxisDemand]:
         north, east, _ = triple(state, P)
-        return self._horizontal.move((sticks.pitch, sticks.roll), heading, (north, east), dt)
+        prevention = self._prevention
+        constrain = None
+        if prevention.is_on:
+            constrain = partial(
+                prevention.constrain,
+                obstacles=self._context.obstacles,
+                yaw=quat_yaw(state[Q:RATES]),
+                now_us=self._time_us or 0,
+            )
+        else:
+            prevention.rest()
+        deflected = sticks.pitch, sticks.roll
+        return self._horizontal.move(deflected, heading, (north, east), dt, constrain)
+
+    def is_done(self, _state: Vector, /) -> bool:
+        """Return whether obstacles have been unknown for so long that nobody should steer."""
+        return self._prevention.gives_up

@@ -41,6 +41,10 @@ def superexpo(x: float, share: float, steeper: float) -> float:
     return expo(x, share) * (1.0 - steeper) / (1.0 - abs(x) * steeper)
 
 
+Pair = tuple[float, float]
+"""North and east."""
+
+
 class AxisDemand(NamedTuple):
     """What is commanded on one axis; NaN = no position."""
 
@@ -139,8 +143,12 @@ class HorizontalStick:
         yaw: float,
         position: tuple[float, float],
         dt: float,
+        constrain: Callable[[Pair, Pair], Pair] | None = None,
     ) -> tuple[AxisDemand, AxisDemand]:
-        """Return the demands north and east; sticks forward and right, the heading [rad]."""
+        """Return the demands north and east; sticks forward and right, the heading [rad].
+
+        `constrain` returns what may be flown of an acceleration at a velocity setpoint.
+        """
         value = self._value
         speed, force = value("MPC_VEL_MANUAL"), 2.0 * value("MPC_ACC_HOR")
         north, east = self._direction(sticks, yaw)
@@ -148,7 +156,10 @@ class HorizontalStick:
         boost = max(2.0, math.sqrt(speed)) if released else 1.0
         self._boost += (boost - self._boost) * dt / (dt + _BOOST_TAU_S)
         drag = [force / speed * self._boost * v for v in self._dragged()]
-        wanted = [north * force, east * force]
+        wanted = north * force, east * force
+        if constrain is not None:
+            wanted = constrain(wanted, self._velocity)
+            released = wanted == (0.0, 0.0)
         before = self._acceleration
         reversing = any(w * b < 0.0 for w, b in zip(wanted, before, strict=True))
         if (released or reversing) and math.hypot(*self._velocity) < math.hypot(*drag) * dt:

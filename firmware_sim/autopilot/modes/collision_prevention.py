@@ -1,0 +1,250 @@
+"""Collision prevention: in Position mode the sticks lead no closer to an obstacle than CP_DIST.
+
+Where obstacles are is told by OBSTACLE_DISTANCE, in bins around the vehicle. Where nothing is told
+nothing is flown to, unless CP_GO_NO_DATA allows it, and without any data not at all.
+
+Source: PX4 1.16, lib/collision_prevention: CollisionPrevention and ObstacleMath. Its map is one of
+the body, too, and is not turned between two messages. This vehicle has no DISTANCE_SENSOR.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from airl_mav.core.constants import US_PER_S
+from airl_mav.core.frames import Vector
+from firmware_sim.autopilot.requests import Obstacles
+from firmware_sim.autopilot.trajectory import braking_speed
+
+BINS = 72
+BIN_DEG = 360.0 / BINS
+"""Bin 0 is straight ahead, the numbers rise clockwise."""
+
+UNKNOWN_CM = 65_535
+"""Distance of a bin of which nothing is known."""
+
+STALE_US = US_PER_S // 2
+"""Data that are older are forgotten (RANGE_STREAM_TIMEOUT_US) [µs]."""
+
+GIVE_UP_US = 5 * US_PER_S
+"""So long without data, the mode ends in Hold (TIMEOUT_HOLD_US) [µs]."""
+
+_DEFLECTED_M_S2 = 1e-3
+"""From this acceleration on the sticks are deflected."""
+
+_M_PER_CM = 0.01
+
+
+class ObstacleMap:
+    """How far the nearest obstacle is in each direction of the body, as was told last."""
+
+    def __init__(self) -> None:
+        """Begin without data."""
+        self.distances_cm = np.full(BINS, float(UNKNOWN_CM))
+        self.seen_us = np.zeros(BINS)
+        """When each was told."""
+        self.ranges_cm = np.zeros(BINS)
+        """Range of what told it."""
+        self.told = np.zeros(BINS, dtype=bool)
+        """Whether it has ever been told: lies in some sensor's field of view."""
+        self.nearest_cm = UNKNOWN_CM
+        """What is nearer cannot be measured."""
+        self.time_us = 0
+        """When the newest data came."""
+
+    def take(self, obstacles: Obstacles, yaw: float) -> None:
+        """Take what was told, at a heading [rad]."""
+        self.time_us = max(self.time_us, obstacles.time_us)
+        self.nearest_cm = min(self.nearest_cm, obstacles.nearest_cm)
+        offset = obstacles.offset_deg - (math.degrees(yaw) if obstacles.in_world else 0.0)
+        count = min(BINS, math.ceil(360.0 / obstacles.increment_deg))
+        mine = _edges(BINS, BIN_DEG, 0.0)
+        told = _edges(count, obstacles.increment_deg, offset)
+        for i, j in np.argwhere(_overlap(mine, told)).tolist():
+            distance_cm = obstacles.distances_cm[j]
+            if distance_cm != UNKNOWN_CM and self._replaces(i, distance_cm, obstacles.farthest_cm):
+                self.distances_cm[i] = distance_cm
+                self.seen_us[i] = self.time_us
+                self.ranges_cm[i] = obstacles.farthest_cm
+                self.told[i] = True
+
+    def forget(self, now_us: int) -> None:
+        """Forget what is stale."""
+        self.distances_cm[now_us - self.seen_us > STALE_US] = UNKNOWN_CM
+
+    def has_data(self, now_us: int) -> bool:
+        """Return whether anything is known."""
+        fresh = now_us - self.time_us < STALE_US
+        return fresh and bool((self.distances_cm < UNKNOWN_CM).any())
+
+    def _replaces(self, i: int, reading_cm: float, range_cm: float) -> bool:
+        """Return whether a reading is used (`_enterData`).
+
+        Of several sensors that see something it is the one with the shorter range, and of several
+        that see nothing the one with the longer.
+        """
+        before_in_range = self.distances_cm[i] < self.ranges_cm[i]
+        if reading_cm < range_cm:
+            return bool(not before_in_range or range_cm <= self.ranges_cm[i])
+        if before_in_range:
+            return bool(range_cm == self.ranges_cm[i])
+        return bool(range_cm >= self.ranges_cm[i])
+
+
+class CollisionPrevention:
+    """Changes the acceleration that the sticks ask for."""
+
+    def __init__(self, value: Callable[[str], float]) -> None:
+        """Begin without data; `value` looks up a PX4 parameter by its name."""
+        self._value = value
+        self.map = ObstacleMap()
+        self._taken: Obstacles | None = None
+        self._active_us: int | None = None
+        """Since when it is switched on."""
+        self.gives_up = False
+        """Whether there has been no data for so long that the mode must not go on."""
+
+    @property
+    def is_on(self) -> bool:
+        """Whether CP_DIST asks for it."""
+        return self._value("CP_DIST") > 0.0
+
+    def rest(self) -> None:
+        """Note that it is not used now."""
+        self._active_us, self.gives_up = None, False
+
+    def constrain(
+        self,
+        wanted: tuple[float, float],
+        velocity: tuple[float, float],
+        obstacles: Obstacles | None,
+        yaw: float,
+        now_us: int,
+    ) -> tuple[float, float]:
+        """Return the acceleration (north, east) [m/s²] that may be flown.
+
+        Args:
+            wanted: What the sticks ask for, north and east [m/s²].
+            velocity: The velocity setpoint, north and east [m/s].
+            obstacles: What was told last; None = nothing yet.
+            yaw: Heading [rad].
+            now_us: Now.
+        """
+        self._active_us = now_us if self._active_us is None else self._active_us
+        fresh = obstacles is not None and now_us - obstacles.time_us < STALE_US
+        if obstacles is not None and obstacles is not self._taken and fresh:
+            self._taken = obstacles
+            self.map.take(obstacles, yaw)
+        self.map.forget(now_us)
+        if not self.map.has_data(now_us):
+            # Nothing is known: nothing is flown to.
+            since_us = max(self.map.time_us, self._active_us)
+            self.gives_up = now_us - since_us > GIVE_UP_US
+            return 0.0, 0.0
+        length = math.hypot(*wanted)
+        if length <= _DEFLECTED_M_S2:
+            return wanted
+        directions = yaw + np.radians(BIN_DEG * np.arange(BINS))
+        bins = np.stack([np.cos(directions), np.sin(directions)], axis=1)
+        index, direction = self._guided(np.array(wanted) / length, yaw, bins)
+        allowed = np.zeros(2)
+        if self._is_feasible(index):
+            allowed = length * self._scaled(direction, yaw, bins)
+        north, east = (allowed + self._braking(np.array(velocity), bins, now_us)).tolist()
+        return north, east
+
+    @property
+    def _keep_m(self) -> float:
+        """The least distance that is kept [m]."""
+        return max(_M_PER_CM * self.map.nearest_cm, self._value("CP_DIST"))
+
+    def _guided(self, direction: Vector, yaw: float, bins: Vector) -> tuple[int, Vector]:
+        """Return bin and direction, turned by up to CP_GUIDE_ANG to where there is more room."""
+        ahead = math.degrees(math.atan2(direction[1], direction[0]) - yaw) % 360.0
+        asked = best = int(ahead // BIN_DEG)
+        distances, keep_cm = self.map.distances_cm, 100.0 * self._value("CP_DIST")
+        known = np.where(distances == UNKNOWN_CM, keep_cm, distances)
+        least, most = math.inf, int(self._value("CP_GUIDE_ANG") // BIN_DEG)
+        for aside in range(-most, most + 1):
+            i = (asked + aside) % BINS
+            mean = (known[i - 1] + known[i] + known[(i + 1) % BINS]) / 3.0
+            cost = 0.5 * keep_cm * abs(aside) - mean - distances[i]
+            if cost < least and distances[i] != UNKNOWN_CM:
+                least, best = cost, i
+        return (asked, direction) if best == asked else (best, bins[best])
+
+    def _is_feasible(self, index: int) -> bool:
+        """Return whether there are data where it is asked to go, or may be none."""
+        if self.map.distances_cm[index] != UNKNOWN_CM:
+            return True
+        return bool(self._value("CP_GO_NO_DATA")) and not self.map.told[index]
+
+    def _scaled(self, direction: Vector, yaw: float, bins: Vector) -> Vector:
+        """Return a direction, shorter as it leads to the closest obstacle."""
+        closest = int(np.argmin(self.map.distances_cm))
+        towards = bins[closest]
+        share = float(direction @ towards)
+        if share <= 0.0:
+            return direction
+        normal = share * towards
+        tangential = direction - normal
+        beside_m = 0.0
+        if np.linalg.norm(tangential) > 1e-6:
+            angle = math.degrees(math.atan2(tangential[1], tangential[0]) - yaw) % 360.0
+            beside_m = _M_PER_CM * self.map.distances_cm[round(angle / BIN_DEG) % BINS]
+        ahead_m = _M_PER_CM * float(self.map.distances_cm[closest])
+        scaled: Vector = tangential * self._scale(beside_m) + normal * self._scale(ahead_m)
+        return scaled
+
+    def _scale(self, distance_m: float) -> float:
+        """Return the share of an acceleration towards something so far away; below 0: away."""
+        keep_m = self._keep_m
+        over_m = distance_m - keep_m
+        reach_m = max(keep_m, self._value("MPC_VEL_MANUAL") / self._value("MPC_XY_P"))
+        return min(1.0, (over_m / reach_m) ** 2 if over_m > 0.0 else over_m)
+
+    def _braking(self, velocity: Vector, bins: Vector, now_us: int) -> Vector:
+        """Return the acceleration (2,) that keeps it able to stop in time."""
+        value, obstacles = self._value, self.map
+        hardest, away = math.inf, np.zeros(2)
+        for i in range(BINS):
+            distance_cm = float(obstacles.distances_cm[i])
+            if not obstacles.nearest_cm < distance_cm < UNKNOWN_CM:
+                continue
+            towards = max(0.0, float(velocity @ bins[i]))
+            delayed_m = towards * value("CP_DELAY")
+            if distance_cm < obstacles.ranges_cm[i]:
+                delayed_m += towards * (now_us - float(obstacles.seen_us[i])) / US_PER_S
+            left_m = _M_PER_CM * distance_cm - self._keep_m - delayed_m
+            most = 0.0
+            if left_m >= 0.0:
+                most = braking_speed(left_m, value("MPC_ACC_HOR"), value("MPC_JERK_MAX"))
+            brake = value("MPC_XY_VEL_P_ACC") * min(most - towards, 0.0)
+            if brake < hardest:
+                hardest, away = brake, bins[i]
+        braked: Vector = hardest * away if math.isfinite(hardest) else away
+        return braked
+
+
+def _edges(count: int, width_deg: float, offset_deg: float) -> Vector:
+    """Return the lower and upper edge (count, 2) [deg] of bins; the lower one lies in -360..360."""
+    numbers = np.arange(count)
+    per_turn = 360.0 / width_deg
+    lower = (np.mod(numbers, per_turn) * width_deg + offset_deg - 0.5 * width_deg) % 360.0
+    upper = (np.mod(numbers + 1, per_turn) * width_deg + offset_deg - 0.5 * width_deg) % 360.0
+    return np.stack([np.where(lower > upper, lower - 360.0, lower), upper], axis=1)
+
+
+def _overlap(mine: Vector, told: Vector) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+    """Return which of my bins (n, 2) lie in which of those that were told (m, 2): (n, m)."""
+    lower, upper = mine[:, None, 0], mine[:, None, 1]
+    low, high = told[None, :, 0], told[None, :, 1]
+    begins = (low > lower) & (low < upper)
+    ends = (high > lower) & (high < upper)
+    around = (low <= lower) & (high >= upper)
+    within = (low >= lower) & (high <= upper)
+    found: np.ndarray[tuple[int, ...], np.dtype[np.bool_]] = begins | ends | around | within
+    return found
