@@ -34,7 +34,8 @@ class Dialect:
     its arming [s]."""
 
 
-_POSITION = ("is_local_position_ok", "is_global_position_ok")
+POSITION = ("is_local_position_ok", "is_global_position_ok")
+"""Flags of MAVSDK's health that are about positions."""
 
 PX4 = Dialect(
     "PX4",
@@ -45,7 +46,7 @@ PX4 = Dialect(
         "is_gyrometer_calibration_ok",
         "is_accelerometer_calibration_ok",
         "is_magnetometer_calibration_ok",
-        *_POSITION,
+        *POSITION,
         "is_armable",
     ),
     arm_timeout_s=20.0,
@@ -64,7 +65,7 @@ ARDUPILOT = Dialect(
     # In STABILIZE it may be armed without a position; GUIDED, and so take-off, needs one. MAVSDK's
     # calibration flags are left out: they mean "enabled and healthy now" here, and the pre-arm
     # checks have looked at the calibration.
-    (*_POSITION, "is_home_position_ok", "is_armable"),
+    (*POSITION, "is_home_position_ok", "is_armable"),
     # Its EKF learns the gyros' bias for 40 s before it uses GPS.
     arm_timeout_s=90.0,
 )

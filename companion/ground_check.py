@@ -132,7 +132,7 @@ def look_at_vehicle(link: MavsdkLink, mission: Mission, stop: threading.Event) -
     )
     asked = f"position {rate_hz:.0f} times a second, {RATE_HZ:.0f} were asked for"
     yield Finding("telemetry", rate_hz >= LEAST_SHARE * RATE_HZ, asked)
-    missing = link.missing_health()
+    missing = link.missing_health(by_gps=mission.pilot.origin is None)
     charge, least = status.battery, mission.limits.battery
     yield Finding(
         "battery",

@@ -24,7 +24,7 @@ from mavsdk.plugins.telemetry import FlightMode, Telemetry, TelemetryError, Tele
 from airl_mav.core.clock import Clock, WallClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.policy.observation import Kinematics
-from companion.dialects import PX4, Dialect, dialect_of
+from companion.dialects import POSITION, PX4, Dialect, dialect_of
 from companion.interfaces import STOP, BatteryState, BodyVelocity, LinkError, VehicleStatus
 from companion.mavsdk_connection import exchange_raw, first_autopilot, open_connection, set_timeout
 
@@ -207,11 +207,22 @@ class MavsdkLink:
         """Whether the flight controller reports good sensors and that it may be armed."""
         return not self.missing_health()
 
-    def missing_health(self) -> list[str]:
-        """Return what the flight controller does not report as good, in words."""
+    def missing_health(self, *, by_gps: bool = True) -> list[str]:
+        """Return what the flight controller does not report as good, in words.
+
+        Without GPS MAVSDK's flags of positions say nothing: the global one stays false, the local
+        one comes and goes with messages that contradict each other (PX4 1.16). Whether it may be
+        armed in a mode that needs them is told apart.
+        """
         health = self._telemetry.health()
-        flags = [flag for flag in self.dialect.health if not getattr(health, flag)]
+        needed = [flag for flag in self.dialect.health if by_gps or flag not in POSITION]
+        flags = [flag for flag in needed if not getattr(health, flag)]
         return [flag.removeprefix("is_").removesuffix("_ok").replace("_", " ") for flag in flags]
+
+    @property
+    def has_local_position(self) -> bool:
+        """Whether MAVSDK's newest message on it says that the local position is good."""
+        return bool(self._telemetry.health().is_local_position_ok)
 
     @property
     def armed(self) -> bool:
@@ -269,15 +280,16 @@ class MavsdkLink:
         """
         deadline_us = self._deadline(timeout_s)
         good_since_us, tell_us = self._clock.time_us(), self._clock.time_us()
+        missing: list[str] = []
         while self._clock.time_us() < good_since_us + int(HEALTH_SETTLE_S * US_PER_S):
-            self._check(deadline_us, f"not healthy after {timeout_s:g} s: it refuses to arm", stop)
+            lacking = f" ({', '.join(missing)})" if missing else ""
+            late = f"not healthy after {timeout_s:g} s: it refuses to arm{lacking}"
+            self._check(deadline_us, late, stop)
             self._pause()
-            missing = set(self.missing_health())
-            if origin is not None:
-                # MAVSDK's flag is that of a GPS fix; who may be armed in Hold knows its place.
-                missing.discard("global position")
-                if "armable" in missing and "local position" not in missing:
-                    tell_us = self._tell_origin(origin, tell_us)
+            missing = self.missing_health(by_gps=origin is None)
+            # Before it has a position of its own, an origin would move it away.
+            if origin is not None and "armable" in missing and self.has_local_position:
+                tell_us = self._tell_origin(origin, tell_us)
             if missing:
                 good_since_us = self._clock.time_us()
         while True:

@@ -11,7 +11,6 @@ import numpy as np
 from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.frames import local_to_geodetic
-from airl_mav.core.location import HOME
 from airl_mav.faults.catalogue import End
 from airl_mav.faults.kinds import Phase
 from airl_mav.faults.model import Fault
@@ -75,8 +74,8 @@ def fly_fault(vehicle: VehicleProfile, fault: str, phase: Phase, seed: int) -> F
     words = Fault.model_validate(fault).model_copy(update={"phase": phase, "at_s": AFTER_S})
     setup = EpisodeSetup(vehicle, None, seed, Aircraft(faults=(words,), plant="kernel"))
     autopilot = builtin_autopilot(setup)
-    if not vehicle.uses_gps:
-        autopilot.set_origin(HOME)
+    if (origin := vehicle.told_origin) is not None:
+        autopilot.set_origin(origin)
     simulation = Simulation(
         setup, start_us=0, clock=SimClock(), recording=False, autopilot=autopilot
     )

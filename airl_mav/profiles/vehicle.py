@@ -9,6 +9,8 @@ from pydantic import Field, Strict, model_validator
 from airl_mav.core.constants import C_PER_MAH, GRAVITY_M_S2
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import ProfileModel, quantity
+from airl_mav.core.frames import Geodetic
+from airl_mav.core.location import HOME
 from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.parameters import SPECS, parameter_values
@@ -292,6 +294,11 @@ class VehicleProfile(ProfileModel):
     def uses_gps(self) -> bool:
         """Whether its flight controller knows by GPS where on the globe it is."""
         return self.sensors.gps.fitted and self.parameters.get("EKF2_GPS_CTRL", 1) != 0
+
+    @property
+    def told_origin(self) -> Geodetic | None:
+        """Where a rehearsal tells it that it is, as it has no GPS; None = it knows by itself."""
+        return None if self.uses_gps else HOME
 
     @property
     def thrust_n(self) -> float:

@@ -13,7 +13,6 @@ from pydantic import BaseModel
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.constants import Level
-from airl_mav.core.location import HOME
 from airl_mav.flight.judge import Task
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.setup import BUILT_IN, Part, Setup
@@ -141,8 +140,8 @@ class ResolvedScenario:
         A vehicle without GPS is told where it is: here that is known.
         """
         origin = self.pilot.origin
-        if origin is None and not self.vehicle.uses_gps:
-            origin = HOME.latitude_deg, HOME.longitude_deg, HOME.altitude_m
+        if origin is None and (told := self.vehicle.told_origin) is not None:
+            origin = told.latitude_deg, told.longitude_deg, told.altitude_m
         return replace(
             self.pilot,
             goal_radius_m=ARRIVAL_SHARE * self.pilot.goal_radius_m,

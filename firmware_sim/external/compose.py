@@ -56,7 +56,7 @@ def real_firmware(wanted: Wanted) -> ExternalFlightStack:
             this firmware needs.
     """
     launcher, endpoint = _PARTS[wanted.aircraft.firmware](wanted)
-    observer = Observer(endpoint, "observer")
+    observer = Observer(endpoint, "observer", wanted.vehicle.told_origin)
     return ExternalFlightStack(launcher, observer, wanted.aircraft.real.firmware_timeout)
 
 

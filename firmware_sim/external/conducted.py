@@ -112,7 +112,7 @@ def _instance(wanted: Wanted, instance: int) -> ConductedPx4:
         raise
     stack = ExternalFlightStack(
         launcher,
-        Observer(endpoint, "observer"),
+        Observer(endpoint, "observer", wanted.vehicle.told_origin),
         wanted.aircraft.real.firmware_timeout,
         on_close=link.close,
         look_every_us=LOOK_US,

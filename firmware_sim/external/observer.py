@@ -6,7 +6,9 @@ It sends no commands in flight: companion and ground station talk to the firmwar
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import Any
 
+from airl_mav.core.frames import Geodetic
 from firmware_sim.autopilot.autopilot_state import Message, Severity
 from firmware_sim.autopilot.commander import Flight
 from firmware_sim.external.heartbeat_modes import flight_of
@@ -29,6 +31,12 @@ INTERVALS_US: Mapping[str, int] = {
 }
 """Messages that it requests, and their intervals [µs]: few, as the link may be slow."""
 
+WITHOUT_GPS: Mapping[str, int] = {
+    **{name: us for name, us in INTERVALS_US.items() if name != "GPS_RAW_INT"},
+    "ESTIMATOR_STATUS": 500_000,
+}
+"""The same of a vehicle without GPS."""
+
 ASK_EVERY_US = 1_000_000
 """Interval at which messages that have not arrived are requested again [µs]."""
 
@@ -41,16 +49,32 @@ FORCE = 21196
 REBOOT, SHUT_DOWN = 1, 2
 """First parameter of PREFLIGHT_REBOOT_SHUTDOWN."""
 
+
+def _origin_message(origin: Geodetic, system_id: int) -> Any:
+    latitude, longitude = (round(d * 1e7) for d in (origin.latitude_deg, origin.longitude_deg))
+    altitude_mm = round(origin.altitude_m * 1e3)
+    return dialect.MAVLink_set_gps_global_origin_message(
+        system_id, latitude, longitude, altitude_mm
+    )
+
+
 _PREARM = dialect.MAV_SYS_STATUS_PREARM_CHECK
 
 
 class Observer:
     """One link to external firmware. Nothing blocks, and no received message raises."""
 
-    def __init__(self, endpoint: Endpoint, name: str) -> None:
-        """Take the link to the firmware; `name` is its name in the traffic counters."""
+    def __init__(self, endpoint: Endpoint, name: str, origin: Geodetic | None = None) -> None:
+        """Take the link to the firmware.
+
+        Args:
+            endpoint: Of the link.
+            name: Its name in the traffic counters.
+            origin: Where it begins, which firmware without GPS is told; None: it knows.
+        """
         self._endpoint = endpoint
         self._name = name
+        self._origin = origin
         self._decoder = Decoder(datagrams=endpoint.datagrams)
         self._encoder = Encoder(SYSTEM_ID, dialect.MAV_COMP_ID_ONBOARD_COMPUTER)
         self._tlog: TlogWriter | None = None
@@ -65,6 +89,8 @@ class Observer:
         self._heard: WireMessage | None = None
         self._landed = int(dialect.MAV_LANDED_STATE_UNDEFINED)
         self._ready = False
+        self._located = False
+        """Whether it says that its position is good; told of firmware without GPS."""
         self._asked_us = -ASK_EVERY_US
         self._came: set[str] = set()
         self._text = ""
@@ -138,7 +164,11 @@ class Observer:
         if now_us - self._asked_us < ASK_EVERY_US:
             return
         self._asked_us = now_us
-        for name, interval_us in INTERVALS_US.items():
+        if self._origin is not None and self._located and not self._ready:
+            # Without it PX4 cannot be armed in Hold, which it boots into. Before it has a position
+            # of its own, an origin would move it away.
+            self._send(_origin_message(self._origin, self._heard.get_srcSystem()))
+        for name, interval_us in (INTERVALS_US if self._origin is None else WITHOUT_GPS).items():
             if name not in self._came:
                 self._command(dialect.MAV_CMD_SET_MESSAGE_INTERVAL, message_id(name), interval_us)
 
@@ -181,6 +211,8 @@ class Observer:
             )
         elif name == "EXTENDED_SYS_STATE":
             self._landed = int(message.landed_state)
+        elif name == "ESTIMATOR_STATUS":
+            self._located = bool(message.flags & dialect.ESTIMATOR_POS_HORIZ_REL)
         elif name == "SYS_STATUS":
             self._ready = bool(message.onboard_control_sensors_health & _PREARM)
         elif name == "STATUSTEXT":

@@ -20,6 +20,7 @@ from airl_mav.cli.parameters import KINDS, ParametersOptions
 from airl_mav.cli.parameters import run as write_parameters
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import validated
+from airl_mav.core.frames import Geodetic
 from airl_mav.profiles.vehicle import CORNERS, VehicleProfile
 from airl_mav.scenario.aircraft import Aircraft, RealFirmware
 from airl_mav.scenario.checks import check_firmware
@@ -282,9 +283,9 @@ def test_values_agree_to_the_precision_of_the_wire() -> None:
 class Far:
     """The firmware's end of a link in memory."""
 
-    def __init__(self) -> None:
+    def __init__(self, origin: Geodetic | None = None) -> None:
         self.endpoint = MemoryEndpoint()
-        self.observer = Observer(self.endpoint, "observer")
+        self.observer = Observer(self.endpoint, "observer", origin)
         self.mav = dialect.MAVLink(None, 1, 1)
         self.said: list[tuple[int, str]] = []
         self.observer.on_message = lambda m: self.said.append((int(m.severity), m.text))
@@ -352,6 +353,29 @@ def test_it_asks_for_what_does_not_come() -> None:
     asked = [m for m in asked if m not in beats]
     assert {m.command for m in asked} == {dialect.MAV_CMD_SET_MESSAGE_INTERVAL}
     assert dialect.MAVLINK_MSG_ID_EXTENDED_SYS_STATE in {int(m.param1) for m in asked}
+
+
+def test_firmware_without_gps_is_told_its_origin_once_it_knows_where_it_is() -> None:
+    far, decoder = Far(Geodetic(47.5, -8.25, 489.4)), dialect.MAVLink(None)
+
+    def sent(now_us: int) -> list[dialect.MAVLink_message]:
+        far.observer.send(now_us)
+        return [decoder.decode(bytearray(frame)) for frame in far.endpoint.take()]
+
+    far.hear(heartbeat(PX4_ID, 4 << 16, 29))
+    first = sent(2_000_000)
+    asked = {int(m.param1) for m in first if m.get_type() == "COMMAND_LONG"}
+    assert dialect.MAVLINK_MSG_ID_ESTIMATOR_STATUS in asked
+    assert dialect.MAVLINK_MSG_ID_GPS_RAW_INT not in asked
+    assert "SET_GPS_GLOBAL_ORIGIN" not in {m.get_type() for m in first}
+    good = dialect.ESTIMATOR_POS_HORIZ_REL
+    far.hear(dialect.MAVLink_estimator_status_message(0, good, *([0.0] * 8)))
+    (told,) = (m for m in sent(4_000_000) if m.get_type() == "SET_GPS_GLOBAL_ORIGIN")
+    place = told.latitude, told.longitude, told.altitude
+    assert (told.target_system, place) == (1, (475_000_000, -82_500_000, 489_400))
+    prearm = dialect.MAV_SYS_STATUS_PREARM_CHECK
+    far.hear(dialect.MAVLink_sys_status_message(prearm, prearm, prearm, *([0] * 10)))
+    assert "SET_GPS_GLOBAL_ORIGIN" not in {m.get_type() for m in sent(6_000_000)}
 
 
 # px4.md: heartbeats as measured.

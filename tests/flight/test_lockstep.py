@@ -88,6 +88,13 @@ def test_the_flight_is_a_flight(reference: FlownEpisode) -> None:
     assert np.all(reference.latency["accepted_us"] > 0), "every decision reached the autopilot"
 
 
+def test_a_vehicle_without_gps_is_told_where_it_is_and_flies() -> None:
+    """By the companion, as on the aircraft: it arms in Hold, which needs a global position."""
+    flight = flown(demo_scenario(vehicle="quad-vio"))
+    assert flight.record.outcome is Outcome.SUCCESS
+    assert flight.record.notes == ()
+
+
 def test_a_take_off_takes_about_as_long_as_movers_are_told(reference: FlownEpisode) -> None:
     record = reference.record
     assert record.navigation_us is not None
