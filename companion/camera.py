@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Protocol
@@ -17,6 +18,9 @@ from airl_mav.scenario.aircraft import GREATEST_PORT
 
 MESSAGES_PER_LOOK = 8
 """Messages that are read at a time, of a publisher that sends faster than they can be read."""
+
+SHARE_S = 0.02
+"""Longest time for which one of two threads that share a source keeps it [wall s]."""
 
 REDIAL_S = 2.0
 """Silence after which the connection is made anew [wall s]."""
@@ -143,6 +147,30 @@ class ZmqFrameSource:
         self._socket.close(linger=0)
         if self._owns_context:
             self._context.term()
+
+
+class SharedFrames:
+    """A frame source for two threads, one of which may wait. Implements `FrameSource`."""
+
+    def __init__(self, frames: FrameSource) -> None:
+        """Share a source that is to be used from one thread at a time."""
+        self._frames = frames
+        self._one_at_a_time = threading.Lock()
+
+    def latest(self) -> ReceivedFrame | None:
+        """Return the newest frame so far; None before the first."""
+        with self._one_at_a_time:
+            return self._frames.latest()
+
+    def wait(self, newer_than_sequence: int, timeout_s: float) -> ReceivedFrame | None:
+        """Wait for a frame that is not the one already seen; see `FrameSource`."""
+        stopwatch = WallClock()
+        while True:
+            left_s = timeout_s - stopwatch.time_us() / US_PER_S
+            with self._one_at_a_time:
+                found = self._frames.wait(newer_than_sequence, min(max(left_s, 0.0), SHARE_S))
+            if found is not None or left_s <= SHARE_S:
+                return found
 
 
 def open_camera(endpoint: str, clock: Clock) -> ZmqFrameSource:

@@ -32,10 +32,12 @@ from airl_mav.scenario.piloting import (
     select_latency,
 )
 from airl_mav.scenario.stand_alone import StandAloneCompanion, check_companion
+from companion.camera import FrameSource, SharedFrames
 from companion.cameras.by_name import OpenCamera, open_named_camera
 from companion.guard import ThreadGuard
 from companion.mavsdk_link import MavsdkLink
 from companion.mission import MissionResult, check_camera, fly_mission
+from companion.obstacles import obstacles_told
 from companion.presence import present
 from companion.signing_proxy import signed
 
@@ -88,6 +90,9 @@ def prepare(asked: StandAloneCompanion) -> Mission:
     loaded = load_asked_policy(asked, policy, pilot.hold_s, asked.seed)
     sampler = injection.sampler(latency_generator(asked.seed, asked.latency_seed))
     vehicle, compensator = load_vehicle(asked.vehicle), None
+    if asked.tell_obstacles and vehicle.camera.kind != "depth":
+        accepted = "with a vehicle whose camera gives depth"
+        raise FieldError("tell_obstacles", asked.tell_obstacles, accepted)
     # What its card says is held against the camera's first frame, before take-off.
     if policy.card is None and (reason := camera_refused(policy, vehicle.camera)):
         raise FieldError(
@@ -131,6 +136,23 @@ def mission_camera(asked: StandAloneCompanion, mission: Mission, clock: Clock) -
     """Open the camera that is asked for. Raises FieldError when it cannot be used."""
     wanted = Intrinsics.of(mission.vehicle.camera)
     return open_named_camera(asked.camera, clock, wanted, f"vehicle {asked.vehicle}")
+
+
+@contextmanager
+def obstacles_reported(
+    asked: StandAloneCompanion,
+    mission: Mission,
+    link: MavsdkLink,
+    camera: FrameSource,
+    clock: Clock,
+) -> Iterator[FrameSource]:
+    """Tell of obstacles, where that is asked for; yield the frames for the policy."""
+    if not asked.tell_obstacles:
+        yield camera
+        return
+    frames, range_m = SharedFrames(camera), mission.vehicle.camera.range_m
+    with obstacles_told(link, frames, range_m, mission.mount_pitch_up_rad, clock):
+        yield frames
 
 
 @contextmanager
@@ -190,14 +212,18 @@ def fly_alone(
 
     with (
         held_to(asked.cpu_quota),
-        closing(mission_camera(asked, mission, clock)) as frames,
+        closing(mission_camera(asked, mission, clock)) as camera,
         signed(asked.connect, asked.signing_key) as url,
         closing(MavsdkLink(url, clock, abandon)) as link,
     ):
         waiting()
         link.connect(asked.connect_timeout, stop)
-        check_camera(mission.policy, frames, stop, mission.compensator)
-        with present(link, clock), recorded(asked, mission, link, clock) as box:
+        check_camera(mission.policy, camera, stop, mission.compensator)
+        with (
+            present(link, clock),
+            obstacles_reported(asked, mission, link, camera, clock) as frames,
+            recorded(asked, mission, link, clock) as box,
+        ):
             result = fly_mission(
                 *(link, frames, mission.policy, mission.goal, clock, stop, abandon, begin),
                 pilot_settings=mission.pilot,
@@ -211,10 +237,10 @@ def fly_alone(
                 decided=None if box is None else box.decided,
             )
             link.tell(f"airl: {result.reason}")
-            if frames.failure is not None:
-                result = replace(result, notes=(*result.notes, frames.failure))
-            if frames.dropped:
-                told = f"{frames.dropped} images of camera {asked.camera} were lost on their way"
+            if camera.failure is not None:
+                result = replace(result, notes=(*result.notes, camera.failure))
+            if camera.dropped:
+                told = f"{camera.dropped} images of camera {asked.camera} were lost on their way"
                 result = replace(result, notes=(*result.notes, told))
             if box is not None:
                 box.end(result.reason, result.notes)

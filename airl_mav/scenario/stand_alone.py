@@ -229,6 +229,12 @@ class StandAloneCompanion(CompanionAddresses, Lateness, Decisions):
         " telemetry, images, status and resources; it survives a crash up to its last second, and"
         " airl report shows it",
     )
+    tell_obstacles: bool = Field(
+        default=False,
+        description="send OBSTACLE_DISTANCE from the depth camera, ten times a second, for the"
+        " flight controller's collision prevention (CP_DIST), which holds back a pilot in Position"
+        " mode",
+    )
     black_box_images_hz: float = quantity(
         "most images that the black box keeps, each one that a decision saw",
         "Hz",
@@ -294,6 +300,8 @@ def check_companion(asked: StandAloneCompanion) -> None:
     if asked.black_box is not None and find_spec("mcap") is None:
         accepted = "with MCAP installed: pip install 'airl-mav[black-box]'"
         raise FieldError("black_box", f"{asked.black_box}", accepted)
+    if asked.lockstep and asked.tell_obstacles:
+        raise FieldError("tell_obstacles", asked.tell_obstacles, "without lockstep")
     if asked.lockstep and asked.check:
         raise FieldError("check", asked.check, "without lockstep")
     if asked.lockstep and asked.start != "arm":
