@@ -13,7 +13,7 @@ import numpy as np
 from airl_mav.core.frames import Vector, quat_from_euler
 from firmware_sim.autopilot.autopilot_state import Message, Severity
 from firmware_sim.autopilot.events import command_events as events
-from firmware_sim.interfaces import UNKNOWN_VARIANCE, Odometry, PoseFrame, VelocityFrame
+from firmware_sim.interfaces import Odometry, PoseFrame, VelocityFrame
 from firmware_sim.mavlink.codec import WireMessage, dialect
 from firmware_sim.mavlink.services.context import Context
 
@@ -61,26 +61,11 @@ def handle_odometry(message: WireMessage, context: Context) -> bool:
             context.announce(Message.of(Severity.CRITICAL, event, kind, text=text))
         return False
     naive = kind == dialect.MAV_ESTIMATOR_TYPE_NAIVE
-    pose = _POSES.get(message.frame_id)
-    twist = _VELOCITIES.get(message.child_frame_id)
-    position, position_variance, orientation_variance = None, UNKNOWN_VARIANCE, UNKNOWN_VARIANCE
-    velocity, velocity_variance = None, UNKNOWN_VARIANCE
-    if pose is not None:
-        frame, other_axes = pose
-        position = _finite(message.x, message.y, message.z)
-        told = _NOT_TOLD if naive else _diagonal(message.pose_covariance)
-        if other_axes and position is not None:
-            position = _ours(frame, position)
-        position_variance = told[:3][[1, 0, 2]] if other_axes and frame == "ned" else told[:3]
-        orientation_variance = told[3:]
-    if twist is not None:
-        frame_of_velocity, other_axes = twist
-        velocity = _finite(message.vx, message.vy, message.vz)
-        told = _NOT_TOLD if naive else _diagonal(message.velocity_covariance)
-        if other_axes and velocity is not None:
-            velocity = _ours(frame_of_velocity, velocity)
-        swapped = other_axes and frame_of_velocity == "ned"
-        velocity_variance = told[:3][[1, 0, 2]] if swapped else told[:3]
+    place = _finite(message.x, message.y, message.z)
+    pose, twist = _POSES.get(message.frame_id), _VELOCITIES.get(message.child_frame_id)
+    position, of_pose = _in_our_axes(pose, place, message.pose_covariance, naive=naive)
+    moving = _finite(message.vx, message.vy, message.vz)
+    velocity, of_twist = _in_our_axes(twist, moving, message.velocity_covariance, naive=naive)
     return _see(
         Odometry(
             position,
@@ -88,9 +73,9 @@ def handle_odometry(message: WireMessage, context: Context) -> bool:
             _rotation(np.array(message.q)),
             pose[0] if pose is not None else "ned",
             twist[0] if twist is not None else "ned",
-            position_variance,
-            velocity_variance,
-            orientation_variance,
+            of_pose[:3],
+            of_twist[:3],
+            of_pose[3:],
             message.reset_counter,
             max(0, message.quality),
         ),
@@ -125,6 +110,32 @@ def _see(odometry: Odometry, context: Context) -> bool:
 def _finite(x: float, y: float, z: float) -> Vector | None:
     vector = np.array([x, y, z])
     return vector if np.isfinite(vector).all() else None
+
+
+def _in_our_axes(
+    frame: tuple[str, bool] | None,
+    vector: Vector | None,
+    covariance: tuple[float, ...],
+    *,
+    naive: bool,
+) -> tuple[Vector | None, Vector]:
+    """Return a vector and variances (6,); None and NaN where they are not known.
+
+    Args:
+        frame: Its frame, and whether that has other axes than ours; None = not one of ours.
+        vector: As it was told (3,).
+        covariance: As it was told.
+        naive: Whether its sender cannot tell one.
+    """
+    if frame is None:
+        return None, _NOT_TOLD
+    name, other_axes = frame
+    variances = _NOT_TOLD if naive else _diagonal(covariance)
+    if not other_axes:
+        return vector, variances
+    if name == "ned":
+        variances = variances[[1, 0, 2, 3, 4, 5]]
+    return None if vector is None else _ours(name, vector), variances
 
 
 def _ours(frame: str, vector: Vector) -> Vector:
