@@ -265,14 +265,17 @@ class Estimator:
 
     # --- measurements
 
-    def _fuse(self, m: Measurement) -> None:
+    def _fuse(self, m: Measurement) -> bool:
+        """Fuse a measurement, if it is within the gate; return whether it was."""
         if self.innovations is not None:
             s = m.h @ self.filter.covariance @ m.h.T + np.diag(m.variance)
             self.innovations(m.name, m.innovation.copy(), s)
         ratio = self.filter.fuse(self.state, m.innovation, m.h, m.variance)
         self.state[m.slot] = ratio
-        if ratio <= 1.0:
+        within = ratio <= 1.0
+        if within:
             m.fused_us = self._time_us
+        return within
 
     def _fuse_gps(self, fix: GpsFix) -> None:
         if self.origin is None:

@@ -60,7 +60,7 @@ class ExternalVision:
         value: Callable[[str], float],
         state: Vector,
         error_filter: ErrorFilter,
-        fuse: Callable[[Measurement], None],
+        fuse: Callable[[Measurement], bool],
         judge: Callable[[Vector, Vector], float],
     ) -> None:
         """Begin without any.
@@ -69,7 +69,7 @@ class ExternalVision:
             value: Looks up EKF2_* parameters by name.
             state: The nominal state, by `error_state`'s layout; updated.
             error_filter: Carries its covariance; restarted where the state is put elsewhere.
-            fuse: Fuses a measurement now.
+            fuse: Fuses a measurement now; returns whether it was within the gate.
             judge: Looks at the innovation (3,) of a velocity of some variance (3,), restarts the
                 filter where that says that inertial sensors are wrong, and returns how many times
                 the variance the velocity's is.
@@ -119,7 +119,7 @@ class ExternalVision:
         jumped = previous is not None and odometry.reset_counter != previous.reset_counter
         self._learn_frame(odometry, anew=jumped)
         if asked & Control.YAW:
-            self._take_yaw(odometry, begins=begins, good=good, jumped=jumped, gps=gps)
+            self._take_yaw(odometry, now_us, begins=begins, good=good, jumped=jumped, gps=gps)
         if asked & Control.VELOCITY:
             self._take_velocity(odometry, begins=begins, good=good)
         if asked & Control.HORIZONTAL and not gps:
@@ -129,7 +129,7 @@ class ExternalVision:
         elif gps:
             self.fused &= ~Control.HORIZONTAL
         if asked & Control.VERTICAL and self._value("EKF2_HGT_REF") == HEIGHT_BY_VISION:
-            self._take_height(odometry, begins=begins, good=good, jumped=jumped)
+            self._take_height(odometry, now_us, begins=begins, good=good, jumped=jumped)
         else:
             self.fused &= ~Control.VERTICAL
         if good:
@@ -161,7 +161,14 @@ class ExternalVision:
     # --- heading
 
     def _take_yaw(
-        self, odometry: Odometry, *, begins: bool, good: bool, jumped: bool, gps: bool
+        self,
+        odometry: Odometry,
+        now_us: int,
+        *,
+        begins: bool,
+        good: bool,
+        jumped: bool,
+        gps: bool,
     ) -> None:
         quaternion, active = odometry.quaternion, bool(self.fused & Control.YAW)
         in_ned = odometry.pose_frame == "ned"
@@ -174,17 +181,29 @@ class ExternalVision:
         noise = self._value("EKF2_EVA_NOISE")
         told = self._variance(odometry.orientation_variance, noise).item(2)
         variance = max(told, noise, LEAST_VARIANCE)
-        if (active and jumped and good) or (not active and not (in_ned and self.is_north_known)):
+        m = self.yaw
+        anew = jumped or self._is_overdue(m, now_us) if active else not self._is_of_globe(in_ned)
+        if anew and good:
             self._filter.restart(turn_to(self._state, self._filter.covariance, yaw, variance))
             self.fused |= Control.YAW
-            self.is_north_known = in_ned
+            self.is_north_known, m.fused_us = in_ned, now_us
         elif good:
-            m, q = self.yaw, es.attitude(self._state)
+            q = es.attitude(self._state)
             m.innovation[0] = math.remainder(yaw - yaw_of(q), 2.0 * math.pi)
             m.variance[0] = variance
             m.h[0, es.ATT : es.GYRO] = yaw_by_turn(q)
-            self._fuse(m)
-            self.fused |= Control.YAW
+            # Where the compass says otherwise, it is not given up for vision.
+            if self._fuse(m):
+                self.fused |= Control.YAW
+
+    def _is_of_globe(self, in_ned: bool) -> bool:
+        """Return whether a heading can be held against the filter's."""
+        return in_ned and self.is_north_known
+
+    def _is_overdue(self, m: Measurement, now_us: int) -> bool:
+        """Return whether it has been refused for so long that it is taken over."""
+        since_us = m.fused_us
+        return since_us is not None and now_us - since_us > self._value("EKF2_NOAID_TOUT")
 
     # --- velocity
 
@@ -232,7 +251,7 @@ class ExternalVision:
             return
         measured, variance = self._place(odometry.position, odometry)
         m = self.position
-        overdue = m.fused_us is not None and now_us - m.fused_us > self._value("EKF2_NOAID_TOUT")
+        overdue = self._is_overdue(m, now_us)
         if not active or (jumped and good) or (overdue and good and self._resets_left > 0):
             self._put(measured, variance)
             m.fused_us = now_us
@@ -248,17 +267,20 @@ class ExternalVision:
             m.variance[:] = variance[:2]
             self._fuse(m)
 
-    def _take_height(self, odometry: Odometry, *, begins: bool, good: bool, jumped: bool) -> None:
+    def _take_height(
+        self, odometry: Odometry, now_us: int, *, begins: bool, good: bool, jumped: bool
+    ) -> None:
         active = bool(self.fused & Control.VERTICAL)
         if odometry.position is None or not (active or begins):
             self.fused &= ~Control.VERTICAL
             return
         measured, variance = self._place(odometry.position, odometry)
-        if not active or (jumped and good):
+        m = self.height
+        if not active or (good and (jumped or self._is_overdue(m, now_us))):
             self._put_height(measured.item(2), variance.item(2))
             self.fused |= Control.VERTICAL
+            m.fused_us = now_us
         elif good:
-            m = self.height
             m.innovation[0] = measured.item(2) - self._then().item(2)
             m.variance[0] = variance.item(2)
             self._fuse(m)

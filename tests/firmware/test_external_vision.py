@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.errors import FieldError
-from airl_mav.core.frames import Vector, geodetic_to_local, quat_wxyz_to_xyzw
+from airl_mav.core.frames import Vector, geodetic_to_local, quat_wxyz_to_xyzw, quat_yaw
 from airl_mav.core.location import HOME
 from airl_mav.experiments.fault_flight import fly_fault
 from airl_mav.profiles.vehicle import load_vehicle
@@ -330,6 +330,50 @@ def test_a_jump_that_is_told_is_taken_over_and_one_that_is_not_is_refused() -> N
     jump = np.zeros(3)
     rig.run(0.2)
     assert np.abs(off(rig)[:2]).max() < 0.3
+
+
+def test_a_height_that_jumps_is_refused_for_a_while_and_then_taken_over() -> None:
+    rig = without_gps(vision={"position_drift_m_sqrt_m": 0.0, "yaw_drift_rad_sqrt_s": 0.0})
+    rig.take_off(4.0)
+    step = rig.ap.step
+    lifted = np.array([0.0, 0.0, -3.0])
+
+    def shifted(sample: Any) -> Any:
+        seen = sample.odometry
+        if seen is not None:
+            seen = seen._replace(position=seen.position + lifted)
+        return step(sample._replace(odometry=seen))
+
+    rig.step_through(shifted)
+    rig.run(3.0)
+    assert abs(off(rig)[2]) < 0.4
+    rig.run(4.0)
+    assert off(rig)[2] == pytest.approx(3.0, abs=0.4)
+
+
+@pytest.mark.parametrize(("wrong_deg", "believed"), [(170.0, False), (5.0, True)])
+def test_a_heading_of_the_globe_has_to_agree_with_the_compass(
+    wrong_deg: float, believed: bool
+) -> None:
+    """As PX4: it begins where it is within the gate, and the compass is given up for it then."""
+    rig = without_gps(EKF2_EVA_NOISE=0.05)
+    step, turn = rig.ap.step, Rotation.from_rotvec([0.0, 0.0, math.radians(wrong_deg)])
+
+    def turned(sample: Any) -> Any:
+        seen = sample.odometry
+        if seen is not None:
+            attitude = turn * Rotation.from_quat(quat_wxyz_to_xyzw(seen.quaternion))
+            quaternion = np.roll(attitude.as_quat(), 1)
+            seen = seen._replace(quaternion=quaternion, pose_frame="ned", velocity_frame="ned")
+        return step(sample._replace(odometry=seen))
+
+    rig.step_through(turned)
+    rig.ap.parameters.set("EKF2_EV_CTRL", 15)
+    rig.run(20.0)
+    assert bool(rig.ap.estimator.vision.fused & Control.YAW) is believed
+    heading_deg = math.degrees(quat_yaw(rig.ap.state().estimate.quaternion))
+    assert heading_deg == pytest.approx(wrong_deg if believed else 0.0, abs=1.5)
+    assert rig.ap.estimator.vision.is_north_known
 
 
 def test_gps_comes_first_where_there_is_both() -> None:
