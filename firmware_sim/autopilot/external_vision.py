@@ -182,7 +182,11 @@ class ExternalVision:
         told = self._variance(odometry.orientation_variance, noise).item(2)
         variance = max(told, noise, LEAST_VARIANCE)
         m = self.yaw
-        anew = jumped or self._is_overdue(m, now_us) if active else not self._is_of_globe(in_ned)
+        if active:
+            anew = jumped or self._is_overdue(m, now_us)
+        else:
+            # There is nothing that it could be held against.
+            anew = not (in_ned and self.is_north_known)
         if anew and good:
             self._filter.restart(turn_to(self._state, self._filter.covariance, yaw, variance))
             self.fused |= Control.YAW
@@ -195,10 +199,6 @@ class ExternalVision:
             # Where the compass says otherwise, it is not given up for vision.
             if self._fuse(m):
                 self.fused |= Control.YAW
-
-    def _is_of_globe(self, in_ned: bool) -> bool:
-        """Return whether a heading can be held against the filter's."""
-        return in_ned and self.is_north_known
 
     def _is_overdue(self, m: Measurement, now_us: int) -> bool:
         """Return whether it has been refused for so long that it is taken over."""
