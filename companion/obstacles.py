@@ -8,7 +8,6 @@ of view as unknown.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from typing import Any, Protocol
 
@@ -23,6 +22,7 @@ from airl_mav.policy.observation import Kinematics
 from airl_mav.policy.scans import NEAREST_M, level_scan, rays_of, tilt_of
 from companion.camera import FrameSource
 from companion.periodic import every
+from companion.presence import Sender
 
 MESSAGE = "OBSTACLE_DISTANCE"
 
@@ -42,15 +42,11 @@ SENSOR_TYPE_UNKNOWN, FRAME_BODY_FRD = 4, 12
 """MAV_DISTANCE_SENSOR and MAV_FRAME (common.xml)."""
 
 
-class Sender(Protocol):
+class Vehicle(Sender, Protocol):
     """What tells how the vehicle is tilted, and sends messages; `MavsdkLink` is one."""
 
     def kinematics(self) -> Kinematics:
         """Return the newest position, velocity and attitude."""
-        ...
-
-    def send_message(self, name: str, fields: Mapping[str, Any]) -> bool:
-        """Send a message by its name and fields; return whether it was sent."""
         ...
 
 
@@ -94,7 +90,7 @@ def obstacle_distance(
 
 
 def obstacles_told(
-    link: Sender, frames: FrameSource, range_m: float, pitch_up_rad: float, clock: Clock
+    link: Vehicle, frames: FrameSource, range_m: float, pitch_up_rad: float, clock: Clock
 ) -> AbstractContextManager[None]:
     """Send the message from a thread, for as long as the context lasts and images come.
 
@@ -110,9 +106,8 @@ def obstacles_told(
         received, now_us = frames.latest(), clock.time_us()
         if received is None or now_us - received.received_us > OLDEST_US:
             return
-        frame = received.frame
-        attitude = link.kinematics().quaternion
-        if not np.isfinite(attitude).all():
+        frame, attitude = received.frame, link.kinematics().quaternion
+        if frame.intrinsics.kind != "depth" or not np.isfinite(attitude).all():
             return
         fields = obstacle_distance(
             frame.image, frame.intrinsics, range_m, attitude, pitch_up_rad, now_us

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from enum import IntFlag
+from typing import NamedTuple
 
 import numpy as np
 
@@ -50,6 +51,19 @@ class Control(IntFlag):
     VERTICAL = 2
     VELOCITY = 4
     YAW = 8
+
+
+class _Sample(NamedTuple):
+    """One pose, and what is thought of it."""
+
+    odometry: Odometry
+    now_us: int
+    good: bool
+    """Of the quality that is asked for."""
+    begins: bool
+    """Whether what is not fused yet may begin: it is good, and poses come often enough."""
+    jumped: bool
+    """Whether it says that it has jumped."""
 
 
 class ExternalVision:
@@ -118,18 +132,17 @@ class ExternalVision:
         begins = good and previous is not None and now_us - self._previous_us < LONGEST_INTERVAL_US
         jumped = previous is not None and odometry.reset_counter != previous.reset_counter
         self._learn_frame(odometry, anew=jumped)
+        sample = _Sample(odometry, now_us, good, begins, jumped)
         if asked & Control.YAW:
-            self._take_yaw(odometry, now_us, begins=begins, good=good, jumped=jumped, gps=gps)
+            self._take_yaw(sample, gps=gps)
         if asked & Control.VELOCITY:
-            self._take_velocity(odometry, begins=begins, good=good)
+            self._take_velocity(sample)
         if asked & Control.HORIZONTAL and not gps:
-            self._take_position(
-                odometry, now_us, begins=begins, good=good, jumped=jumped, flying=flying
-            )
+            self._take_position(sample, flying=flying)
         elif gps:
             self.fused &= ~Control.HORIZONTAL
         if asked & Control.VERTICAL and self._value("EKF2_HGT_REF") == HEIGHT_BY_VISION:
-            self._take_height(odometry, now_us, begins=begins, good=good, jumped=jumped)
+            self._take_height(sample)
         else:
             self.fused &= ~Control.VERTICAL
         if good:
@@ -160,16 +173,8 @@ class ExternalVision:
 
     # --- heading
 
-    def _take_yaw(
-        self,
-        odometry: Odometry,
-        now_us: int,
-        *,
-        begins: bool,
-        good: bool,
-        jumped: bool,
-        gps: bool,
-    ) -> None:
+    def _take_yaw(self, sample: _Sample, *, gps: bool) -> None:
+        odometry, now_us, good, begins, jumped = sample
         quaternion, active = odometry.quaternion, bool(self.fused & Control.YAW)
         in_ned = odometry.pose_frame == "ned"
         # A heading of vision's own frame would turn what GPS measures.
@@ -207,7 +212,8 @@ class ExternalVision:
 
     # --- velocity
 
-    def _take_velocity(self, odometry: Odometry, *, begins: bool, good: bool) -> None:
+    def _take_velocity(self, sample: _Sample) -> None:
+        odometry, _, good, begins, _ = sample
         measured, active = odometry.velocity, bool(self.fused & Control.VELOCITY)
         if measured is None or not (active or begins):
             self.fused &= ~Control.VELOCITY
@@ -234,16 +240,8 @@ class ExternalVision:
 
     # --- position
 
-    def _take_position(
-        self,
-        odometry: Odometry,
-        now_us: int,
-        *,
-        begins: bool,
-        good: bool,
-        jumped: bool,
-        flying: bool,
-    ) -> None:
+    def _take_position(self, sample: _Sample, *, flying: bool) -> None:
+        odometry, now_us, good, begins, jumped = sample
         active = bool(self.fused & Control.HORIZONTAL)
         needs_north = odometry.pose_frame == "ned" and not self.is_north_known
         if odometry.position is None or needs_north or not (active or begins):
@@ -267,9 +265,8 @@ class ExternalVision:
             m.variance[:] = variance[:2]
             self._fuse(m)
 
-    def _take_height(
-        self, odometry: Odometry, now_us: int, *, begins: bool, good: bool, jumped: bool
-    ) -> None:
+    def _take_height(self, sample: _Sample) -> None:
+        odometry, now_us, good, begins, jumped = sample
         active = bool(self.fused & Control.VERTICAL)
         if odometry.position is None or not (active or begins):
             self.fused &= ~Control.VERTICAL

@@ -16,6 +16,7 @@ from firmware_sim.external.parameter_client import ParameterClient
 from firmware_sim.mavlink.codec import Decoder, Encoder, WireMessage, dialect, message_id
 from firmware_sim.mavlink.endpoint import Endpoint
 from firmware_sim.mavlink.link import LinkCounters
+from firmware_sim.mavlink.streams import units
 from firmware_sim.mavlink.tlog import TlogWriter
 
 SYSTEM_ID = 254
@@ -51,10 +52,11 @@ REBOOT, SHUT_DOWN = 1, 2
 
 
 def _origin_message(origin: Geodetic, system_id: int) -> Any:
-    latitude, longitude = (round(d * 1e7) for d in (origin.latitude_deg, origin.longitude_deg))
-    altitude_mm = round(origin.altitude_m * 1e3)
     return dialect.MAVLink_set_gps_global_origin_message(
-        system_id, latitude, longitude, altitude_mm
+        system_id,
+        units.deg_e7(origin.latitude_deg),
+        units.deg_e7(origin.longitude_deg),
+        units.mm(origin.altitude_m),
     )
 
 

@@ -15,6 +15,7 @@ from airl_mav.core.frames import Geodetic, Vector
 from airl_mav.vehicle.atmosphere import altitude_m
 from firmware_sim.interfaces import ActuatorControls, GpsFix, Odometry, SensorSample
 from firmware_sim.mavlink.codec import Reader, Values, WireMessage, dialect, layout
+from firmware_sim.mavlink.streams.units import triangle
 
 SENSOR = layout("HIL_SENSOR")
 GPS = layout("HIL_GPS")
@@ -138,8 +139,8 @@ def odometry(seen: Odometry, time_us: int) -> Values:
         *_known(seen.quaternion, 4),
         *_known(seen.velocity, 3),
         *_known(None, 3),
-        *_covariance(*seen.position_variance.tolist(), *seen.orientation_variance.tolist()),
-        *_covariance(*seen.velocity_variance.tolist(), *_known(None, 3)),
+        *triangle((*seen.position_variance.tolist(), *seen.orientation_variance.tolist())),
+        *triangle((*seen.velocity_variance.tolist(), *_known(None, 3))),
         seen.reset_counter,
         dialect.MAV_ESTIMATOR_TYPE_VIO,
         seen.quality,
@@ -189,11 +190,6 @@ def controls(message: Controls, time_us: int) -> ActuatorControls:
 
 def _known(values: Vector | None, width: int) -> tuple[float, ...]:
     return (math.nan,) * width if values is None else tuple(values.tolist())
-
-
-def _covariance(a: float, b: float, c: float, d: float, e: float, f: float) -> Values:
-    """Return the upper triangle, row by row, of a 6 x 6 matrix with that diagonal, else 0."""
-    return a, 0, 0, 0, 0, 0, b, 0, 0, 0, 0, c, 0, 0, 0, d, 0, 0, e, 0, f
 
 
 def _saturated(measured: Vector, limit: float) -> tuple[float, float, float]:

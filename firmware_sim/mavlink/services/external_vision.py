@@ -16,6 +16,7 @@ from firmware_sim.autopilot.events import command_events as events
 from firmware_sim.interfaces import Odometry, PoseFrame, VelocityFrame
 from firmware_sim.mavlink.codec import WireMessage, dialect
 from firmware_sim.mavlink.services.context import Context
+from firmware_sim.mavlink.streams.units import DIAGONAL
 
 _FUSED = (
     dialect.MAV_ESTIMATOR_TYPE_UNKNOWN,
@@ -38,9 +39,6 @@ _VELOCITIES: dict[int, tuple[VelocityFrame, bool]] = {
     dialect.MAV_FRAME_BODY_OFFSET_NED: ("body", False),
     dialect.MAV_FRAME_BODY_FRD: ("body", False),
 }
-
-_DIAGONAL = (0, 6, 11, 15, 18, 20)
-"""Where a 6 x 6 matrix that is sent as its upper triangle has its diagonal."""
 
 _NOT_TOLD = np.full(6, np.nan)
 
@@ -146,7 +144,7 @@ def _ours(frame: str, vector: Vector) -> Vector:
 
 def _diagonal(triangle: tuple[float, ...]) -> Vector:
     """Return the diagonal (6,) of a covariance; NaN where it is not known."""
-    return np.array([triangle[i] for i in _DIAGONAL])
+    return np.array([triangle[i] for i in DIAGONAL])
 
 
 def _rotation(quaternion: Vector) -> Vector | None:

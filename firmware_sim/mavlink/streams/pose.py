@@ -89,8 +89,8 @@ def odometry(state: AutopilotState) -> Values:
         *estimate.quaternion.tolist(),
         *estimate.velocity.tolist(),
         *estimate.angular_velocity.tolist(),
-        *_covariance(x, y, z, roll, pitch, yaw),
-        *_covariance(vx, vy, vz, math.nan, math.nan, math.nan),
+        *units.triangle((x, y, z, roll, pitch, yaw)),
+        *units.triangle((vx, vy, vz, math.nan, math.nan, math.nan)),
         reset_counter,
         dialect.MAV_ESTIMATOR_TYPE_AUTOPILOT,
         _UNRATED,
@@ -216,12 +216,6 @@ def _wire(place: Geodetic) -> Values:
         units.deg_e7(place.longitude_deg),
         units.mm(place.altitude_m),
     )
-
-
-def _covariance(a: float, b: float, c: float, d: float, e: float, f: float) -> Values:
-    """Return the upper triangle, row by row, of a 6 x 6 matrix with that diagonal, else NaN."""
-    n = math.nan
-    return a, n, n, n, n, n, b, n, n, n, n, c, n, n, n, d, n, n, e, n, f
 
 
 @kernel

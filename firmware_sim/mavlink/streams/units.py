@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Final
 
 from numba.extending import register_jitable
@@ -73,3 +74,14 @@ def centidegrees(angle_rad: float) -> int:
 
 for _function in (saturate, int16, int32, boot_ms, deg_e7, mm, cm_s, centidegrees):
     register_jitable(_function)  # so that kernels can call them, as Python can
+
+
+DIAGONAL = (0, 6, 11, 15, 18, 20)
+"""Where a 6 x 6 matrix that is sent as its upper triangle, row by row, has its diagonal."""
+
+
+def triangle(diagonal: Sequence[float]) -> tuple[float, ...]:
+    """Return a matrix as it is sent, by its diagonal (6,); the rest is not known: NaN."""
+    a, b, c, d, e, f = diagonal
+    n = math.nan
+    return a, n, n, n, n, n, b, n, n, n, n, c, n, n, n, d, n, n, e, n, f
