@@ -12,8 +12,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
-from airl_mav.core.clock import Clock
-from airl_mav.core.constants import TICK_US, US_PER_S
+from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Geodetic
 from airl_mav.core.signing import Signing
 from firmware_sim.mavlink.allowance import Allowance
@@ -23,6 +22,7 @@ from firmware_sim.mavlink.event_buffer import EventSender
 from firmware_sim.mavlink.link import Link, LinkCounters
 from firmware_sim.mavlink.services.context import Context
 from firmware_sim.mavlink.texts import TextEncoder
+from firmware_sim.mavlink.tick_time import ListeningTime, TickTime
 
 MAX_CLIENTS = 32
 """Clients of a link at a time, the preset remote not counted."""
@@ -39,10 +39,6 @@ SILENT_US = 600 * US_PER_S
 GONE_US = 5 * US_PER_S
 """Where a link has all its clients, one that was silent for so long makes room for another [µs].
 Heartbeats come every second."""
-
-LISTEN_US = TICK_US // 8
-"""Longest time of a tick that goes into what arrives on one link [µs of the pacing clock]. What is
-left waits for the next tick."""
 
 
 @dataclass(slots=True, eq=False)
@@ -95,7 +91,7 @@ class Clients:
         name: str,
         endpoint: SharedEndpoint,
         welcome: Callable[[Peer, Endpoint], Client],
-        clock: Clock | None = None,
+        tick_time: TickTime,
         signing: Signing | None = None,
     ) -> None:
         """Begin with the preset remote, where there is one.
@@ -104,17 +100,16 @@ class Clients:
             name: Of the link.
             endpoint: Where its clients are.
             welcome: Makes a client of who is heard for the first time.
-            clock: Measures the time that what arrives takes out of a tick; None: it may take any.
+            tick_time: Bounds the time that what arrives takes out of a tick.
             signing: Checks what strangers send; None: there is no key.
         """
         self.name = name
         self.endpoint = endpoint
         self._welcome = welcome
-        self._clock = clock
+        self._listening = ListeningTime(tick_time)
         self._signing = signing
-        self._spent_us = 0
         self._backlog: deque[tuple[Client, WireMessage]] = deque()
-        """What was decoded when the link's share of the tick was spent."""
+        """What was decoded when the link's time of the tick was spent."""
         self._clients: dict[Peer, Client] = {}
         self._doorkeeper = Decoder(datagrams=endpoint.datagrams)
         """Reads what nobody known has sent."""
@@ -145,7 +140,7 @@ class Clients:
 
     def renew(self) -> None:
         """Begin another tick: what arrives may take its time again."""
-        self._spent_us = 0
+        self._listening.renew()
 
     def restart(self, now_us: int) -> None:
         """Take simulated `now_us` [µs] as the present, whatever it was before."""
@@ -159,24 +154,20 @@ class Clients:
     def receive(self, now_us: int) -> Iterator[tuple[Client, WireMessage]]:
         """Yield what has arrived by simulated `now_us` [µs], and from whom, oldest first.
 
-        What exceeds the allowance of its sender is dropped and counted; when the link's share of
-        the tick is spent, the rest waits.
+        What exceeds the allowance of its sender is dropped and counted; when the link's time of the
+        tick is spent, the rest waits.
         """
-        clock, backlog = self._clock, self._backlog
-        if clock is not None and self._spent_us >= LISTEN_US:
-            return
-        began_us = 0 if clock is None else clock.time_us() - self._spent_us
+        backlog, listening = self._backlog, self._listening
         arrivals = self.endpoint.arrivals()
-        while clock is None or self._spent_us < LISTEN_US:
+        listening.begin()
+        while listening.left():
             if backlog:
                 yield backlog.popleft()
-            else:
-                arrived = next(arrivals, None)
-                if arrived is None:
-                    return
-                backlog.extend(self._heard(*arrived, now_us))
-            if clock is not None:
-                self._spent_us = clock.time_us() - began_us
+                continue
+            arrived = next(arrivals, None)
+            if arrived is None:
+                return
+            backlog.extend(self._heard(*arrived, now_us))
 
     def _heard(self, peer: Peer, chunk: bytes, now_us: int) -> Iterator[tuple[Client, WireMessage]]:
         """Yield what a chunk says, and who has sent it; nothing of what exceeds an allowance."""

@@ -23,6 +23,10 @@ MAX_DATAGRAM = 4096
 MAX_DATAGRAMS_PER_CALL = 256
 """Datagrams read per `receive`: a flood must not delay the flight controller."""
 
+RECEIVE_BUFFER_BYTES = 1 << 20
+"""What a socket may hold while the host lets the simulator wait: some 2,500 short datagrams, or as
+many as Linux allows (net.core.rmem_max: 500 by default)."""
+
 _MARKERS = (0xFD, 0xFE)
 
 
@@ -205,6 +209,7 @@ class UdpEndpoint:
         """The newest sender that is not the preset remote, None before any."""
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
         try:
             self._socket.bind(local)
         except OSError as error:

@@ -30,16 +30,20 @@ from firmware_sim.mavlink.services.running_calibration import RunningCalibration
 from firmware_sim.mavlink.streams import BUILDERS, Builder
 from firmware_sim.mavlink.streams.status import system_time
 from firmware_sim.mavlink.texts import REPLY_IDS, TextEncoder
+from firmware_sim.mavlink.tick_time import TickTime
 from firmware_sim.mavlink.tlog import TlogWriter
 from firmware_sim.mavlink.traffic_log import TrafficLog
 from firmware_sim.storage import Storage
 
-_DISCARD_CALLS = 4
-"""Reads that empty a link for sure: four times 256 datagrams exceed a socket's buffer."""
+_DISCARD_CALLS = 16
+"""Reads that empty a link for sure: so many times 256 datagrams exceed a socket's buffer."""
 
 PIECES_PER_TICK = 32
 """Messages of lists and files that all clients together get per tick: 8,000 a second. One client
 gets less in its turn; many share it, and a tick stays a tick."""
+
+LEAST_PIECES_PER_TICK = 4
+"""What they get of them in a tick that would be late with more: 1,000 a second."""
 
 STREAMS_PER_TICK = 256
 """Streamed messages of all clients together per tick: 64,000 a second, a hundred times what PX4
@@ -81,13 +85,14 @@ class MavlinkServer:
             port: The autopilot; None: it comes later (`attach`).
             boot_unix_us: Calendar time of simulated time 0 [µs since 1970, UTC].
             storage: The vehicle's files, for MAVLink FTP; None: temporary ones. Closed with it.
-            clock: Measures what part of a tick goes into received messages, and bounds it; None,
-                or a clock that stands still meanwhile: it is bounded by their number only.
+            clock: Measures what part of a tick goes into received messages and bulk transfers, and
+                bounds it; None, or a clock that stands still meanwhile: it is bounded by their
+                number only.
             signing: The key that is asked for on all links; None: there is none until a client
                 sets one, which is forgotten with the server.
         """
         self._port: AutopilotPort | None = None
-        self._clock = clock
+        self._tick_time = TickTime(clock)
         self._stored = signing
         self._signing = (
             Signing(lambda: boot_unix_us + self._now_us) if signing is None else signing.signing
@@ -168,6 +173,7 @@ class MavlinkServer:
         To be called once per tick.
         """
         self._now_us = now_us
+        self._tick_time.renew(now_us)
         port = self._port
         if port is None:
             return
@@ -217,7 +223,9 @@ class MavlinkServer:
         sent = 0
         for turn in range(len(clients)):
             place = (first + turn) % len(clients)
-            if sent >= PIECES_PER_TICK:
+            if sent >= PIECES_PER_TICK or (
+                sent >= LEAST_PIECES_PER_TICK and self._tick_time.is_short()
+            ):
                 self._first_in_turn = place
                 return
             context, link = clients[place].context, clients[place].link
@@ -279,7 +287,7 @@ class MavlinkServer:
                 link.scheduler.restart()
             return client
 
-        return Clients(config.name, config.endpoint, welcome, self._clock, self._signing)
+        return Clients(config.name, config.endpoint, welcome, self._tick_time, self._signing)
 
     def _connect(self, client: Client, port: AutopilotPort) -> None:
         client.link.identify(self._system_id)

@@ -7,14 +7,16 @@ from contextlib import closing
 from itertools import pairwise
 from pathlib import Path
 
+import pytest
 from pymavlink.dialects.v20 import common as dialect
 
+from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import TICK_US, US_PER_S
 from firmware_sim.flight_log.flight_log import FlightLog
 from firmware_sim.flight_log.log_folder import LogFolder
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from firmware_sim.mavlink.link import gcs_link, onboard_link
-from firmware_sim.mavlink.server import PIECES_PER_TICK, MavlinkServer
+from firmware_sim.mavlink.server import LEAST_PIECES_PER_TICK, PIECES_PER_TICK, MavlinkServer
 from firmware_sim.mavlink.services.logs import PACKETS_PER_TICK
 from tests.support.kinematic_autopilot import KinematicAutopilot
 from tests.support.memory_hub import MemoryHub
@@ -73,18 +75,22 @@ def test_twenty_clients_at_50_hz_with_parameter_downloads() -> None:
     assert (counters.dropped, counters.malformed, counters.send_errors) == (0, 0, 0)
 
 
-def test_what_comes_piece_by_piece_is_shared_tick_by_tick(tmp_path: Path) -> None:
+@pytest.mark.parametrize("late", [False, True])
+def test_what_comes_piece_by_piece_is_shared_tick_by_tick(tmp_path: Path, late: bool) -> None:
+    """In a tick that would be late with more, there is less of it."""
     (tmp_path / "flight-000.ulg").write_bytes(bytes(range(1, 256)) * 2_000)
-    hub, autopilot = MemoryHub(), KinematicAutopilot()
+    hub, autopilot, clock = MemoryHub(), KinematicAutopilot(), SimClock()
     log = FlightLog(tmp_path / "flight-001.ulg", autopilot.parameters, 0, 0)
     autopilot.logs = folder = LogFolder(tmp_path, log)
-    server = MavlinkServer([gcs_link(hub)], autopilot, boot_unix_us=0)
+    server = MavlinkServer([gcs_link(hub)], autopilot, boot_unix_us=0, clock=clock)
     clients = [hub.client(port, (100 + port, 190)) for port in range(CLIENTS)]
     got = [0] * CLIENTS
+    pieces = LEAST_PIECES_PER_TICK if late else PIECES_PER_TICK
     with closing(log), closing(folder):
         for client in clients:
             client.send(dialect.MAVLink_log_request_data_message(1, 1, 0, 0, 0xFFFF_FFFF))
         for _ in range(100):
+            clock.sleep_until(autopilot.time_us + late * TICK_US)
             server.receive(autopilot.time_us)
             autopilot.step()
             server.send(autopilot.time_us)
@@ -96,5 +102,5 @@ def test_what_comes_piece_by_piece_is_shared_tick_by_tick(tmp_path: Path) -> Non
                     assert offset == 90 * got[n]  # whole, and in order
                     got[n] += 1
                 in_tick += len(frames)
-            assert PIECES_PER_TICK <= in_tick < PIECES_PER_TICK + PACKETS_PER_TICK
+            assert pieces <= in_tick < pieces + PACKETS_PER_TICK
     assert max(got) - min(got) <= PACKETS_PER_TICK
