@@ -37,8 +37,10 @@ from firmware_sim.mavlink.link import gcs_link, onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.pacing import WallPacing
 from firmware_sim.simulation import EpisodeSetup
+from firmware_sim.warm_up import warm_up
 
 HOST = "127.0.0.1"
+VEHICLE = "quad"
 EVERY_S = 0.02
 """Between two commands of a client: 50 Hz."""
 LOG_BYTES = 3_000_000
@@ -234,7 +236,7 @@ def vehicle(clients: int, folder: Path) -> Vehicle:
     links = [onboard_link(api), gcs_link(gcs)]
     server = MavlinkServer(links, boot_unix_us=0, clock=pacing.clock)
     firmware = Firmware(BuiltinFlightStack(server), None, pacing, recording=False)
-    firmware.load(EpisodeSetup(load_vehicle("quad"), None, 1), folder / "flight-001.tlog", 0)
+    firmware.load(EpisodeSetup(load_vehicle(VEHICLE), None, 1), folder / "flight-001.tlog", 0)
     for _ in range(READY_TICKS):
         firmware.step()
     return Vehicle(firmware, pacing, gcs.local, clients)
@@ -250,6 +252,7 @@ def percentiles(values: Sequence[float]) -> str:
 
 
 def main(asked: Bench) -> None:
+    warm_up(load_vehicle(VEHICLE))
     with ExitStack() as stack:
         numbers = 1, asked.clients
         folders = [Path(stack.enter_context(tempfile.TemporaryDirectory())) for _ in numbers]

@@ -35,6 +35,8 @@ def warm_up(vehicle: VehicleProfile, plant: PlantName = DEFAULT_PLANT) -> None:
     arena = generate(spec, 1, name="warm-up", vehicle_width_m=vehicle.body.width_m)
     setup = EpisodeSetup(vehicle, arena, 0, Aircraft(plant=plant))
     autopilot = builtin_autopilot(setup)
+    if (origin := vehicle.told_origin) is not None:
+        autopilot.set_origin(origin)  # without it there is no take-off
     simulation = Simulation(setup, start_us=0, clock=SimClock(), autopilot=autopilot)
     links = [onboard_link(MemoryEndpoint()), gcs_link(MemoryEndpoint())]
     server = MavlinkServer(links, autopilot, boot_unix_us=0)

@@ -4,22 +4,30 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from tests.support.processes import run_alone
 
 PROGRAM = """
 import gc
 from numba.core.dispatcher import Dispatcher
 from firmware_sim.autopilot.autopilot_state import Mode
+from airl_mav.profiles.vehicle import load_vehicle
 from firmware_sim.warm_up import warm_up
-from tests.support.flight_rig import flight, quad, velocity_setpoint
+from tests.support.flight_rig import flight, velocity_setpoint
 
 def compiled():
     kernels = (each for each in gc.get_objects() if isinstance(each, Dispatcher))
     return {(each.__module__, each.__name__): len(each.signatures) for each in kernels}
 
-warm_up(quad())
+vehicle = load_vehicle("VEHICLE")
+warm_up(vehicle)
 before = compiled()
-with flight(1) as rig:
+with flight(1, vehicle=vehicle) as rig:
+    if vehicle.told_origin is not None:
+        rig.ap.set_origin(vehicle.told_origin)
+    rig.run(5.0)
+    rig.sim.capture_due(lambda frame: None)
     rig.take_off(2.5)
     rig.go_offboard(velocity_setpoint(2.0, 0.0, 0.0))
     rig.run(2.0)
@@ -32,6 +40,9 @@ assert not new, new
 """
 
 
-def test_a_flight_asks_for_no_kernel_that_was_not_there_before(tmp_path: Path) -> None:
-    done = run_alone(PROGRAM, tmp_path)
+@pytest.mark.parametrize("vehicle", ["quad", "quad-rgb", "quad-vio"])
+def test_a_flight_asks_for_no_kernel_that_was_not_there_before(
+    vehicle: str, tmp_path: Path
+) -> None:
+    done = run_alone(PROGRAM.replace("VEHICLE", vehicle), tmp_path)
     assert done.returncode == 0, done.stderr

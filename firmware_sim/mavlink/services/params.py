@@ -123,11 +123,5 @@ def _hash_message(store: ParameterStore) -> tuple[str, bytes]:
 
 def parameter_hash(store: ParameterStore) -> int:
     """Return PX4's param_hash_check(): CRC-32 without inversions over all names and values."""
-    crc = 0
-    for index in range(len(store)):
-        parameter = store.by_index(index)
-        if parameter is None:
-            continue
-        data = parameter.name.encode("ascii") + _encoded(parameter.value)
-        crc = crc32part(data, crc)
-    return crc
+    parameters = filter(None, map(store.by_index, range(len(store))))
+    return crc32part(b"".join(p.name.encode("ascii") + _encoded(p.value) for p in parameters))
