@@ -136,6 +136,7 @@ def in_background(flight: Flight, call: Callable[[], Any], what: str) -> Any:
         return future.result()
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_one_episode_after_the_other(flight: Flight, peer: HitlPeer) -> None:
     boots = peer.boots

@@ -560,6 +560,7 @@ def test_return_climbs_flies_home_and_lands() -> None:
         assert rig.truth.position[2] == pytest.approx(REST_DOWN_M, abs=0.01)
 
 
+@pytest.mark.nightly
 def test_return_near_home_does_not_climb() -> None:
     with flight(SEED, parameters={"RTL_RETURN_ALT": 60.0}) as rig:
         rig.take_off(4.0, settle_s=1.0)

@@ -248,6 +248,7 @@ def test_modes_that_cannot_be_armed_in() -> None:
             assert rig.ap.disarm(force=False) is Result.ACCEPTED
 
 
+@pytest.mark.nightly
 def test_flight_time_over_returns() -> None:
     with flight(SEED, parameters={"COM_FLT_TIME_MAX": 12.0, "RTL_RETURN_ALT": 5.0}) as rig:
         out(rig, 3.0)

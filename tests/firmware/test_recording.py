@@ -110,6 +110,7 @@ def blocks_kept_by_two_minutes(*, recording: bool) -> int:
     return kept
 
 
+@pytest.mark.nightly
 def test_memory_stays_bounded_where_nobody_collects_the_record() -> None:
     assert blocks_kept_by_two_minutes(recording=False) < 200
 

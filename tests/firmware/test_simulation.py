@@ -76,6 +76,7 @@ def digest_of_a_flight(seed: int) -> str:
     return digest.hexdigest()
 
 
+@pytest.mark.nightly
 def test_a_seed_is_a_flight_whatever_else_was_flown_before() -> None:
     first = digest_of_a_flight(5)
     others = [Rig(seed, arena=arena("dynamic-obstacles")) for seed in range(4)]
@@ -107,6 +108,7 @@ def test_a_seed_is_a_flight_in_every_process() -> None:
     assert digests == {digest_of_a_flight(5)}
 
 
+@pytest.mark.nightly
 @pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="counts by /proc")
 def test_fifteen_episodes_leave_nothing_behind() -> None:
     place = arena("crowded")

@@ -162,6 +162,7 @@ def test_another_run_is_not_mixed_in(flown: Run) -> None:
         rehearse(asked(), out=flown.path)
 
 
+@pytest.mark.nightly
 def test_it_flies_in_a_thread(tmp_path: Path) -> None:
     """Where Python delivers no signals: in a notebook's executor, behind a server."""
     found: dict[str, Any] = {}

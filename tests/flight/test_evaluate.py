@@ -791,6 +791,7 @@ def test_every_level_flies_by_the_rules_of_the_card(tmp_path: Path) -> None:
         assert resolve(own).rules.startswith("goal radius 4 m, hold 0.7 s, height 2 m")
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.xdist_group("flight")
 @pytest.mark.timeout(300)

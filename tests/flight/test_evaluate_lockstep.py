@@ -134,6 +134,7 @@ def test_a_learned_policy_without_an_input_and_its_card_and_logs(tmp_path: Path)
     assert "'goal' made zero" in load(blind).info.setup.policy.description
 
 
+@pytest.mark.nightly
 def test_a_table_of_arenas(reference: tuple[LoadedRun, str], tmp_path: Path) -> None:
     arenas = (ARENA, "static-obstacles")
     code, text = evaluate("greedy", arena=arenas, episodes=1, workers=1, out=tmp_path / "m")
@@ -221,6 +222,7 @@ def evaluating(folder: Path, out: Path) -> Iterator[Evaluating]:
                     os.kill(pid, signal.SIGKILL)
 
 
+@pytest.mark.nightly
 def test_killed_at_any_moment_it_goes_on_and_nothing_is_lost_or_doubled(
     reference: tuple[LoadedRun, str], tmp_path: Path
 ) -> None:

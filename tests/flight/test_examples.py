@@ -45,6 +45,7 @@ def test_every_example_is_flown() -> None:
     assert {path.name for path in EXAMPLES.glob("*.py")} <= named
 
 
+@pytest.mark.nightly
 def test_rehearse(tmp_path: Path) -> None:
     text = output_of("rehearse.py", tmp_path)
     assert text.count("success") + text.count("collision") == 2
@@ -56,6 +57,7 @@ def test_rehearse(tmp_path: Path) -> None:
     assert (tmp_path / page[1]).is_file()
 
 
+@pytest.mark.nightly
 def test_faults_are_told(tmp_path: Path) -> None:
     text = output_of("faults.py", tmp_path)
     assert "healthy: success" in text
@@ -76,12 +78,14 @@ def test_own_arena(tmp_path: Path) -> None:
     assert len(re.findall(r"^seed [78]: (success|collision|timeout), ", text, re.M)) == 2
 
 
+@pytest.mark.nightly
 def test_own_reward(tmp_path: Path) -> None:
     text = output_of("own_reward.py", tmp_path)
     assert (tmp_path / "short-and-cheap/policy/card.json").is_file()
     assert re.search(r"^(success|collision|timeout): ", text, re.M)
 
 
+@pytest.mark.nightly
 def test_cleanrl_ppo_learns_by_itself_and_its_agent_can_be_exported(tmp_path: Path) -> None:
     text = output_of("cleanrl_ppo.py", tmp_path)
     assert len(re.findall(r"^ *\d+ steps: \d+ of \d+ flights", text, re.M)) == 3
@@ -95,6 +99,7 @@ def test_cleanrl_ppo_learns_by_itself_and_its_agent_can_be_exported(tmp_path: Pa
     assert scores.shape == (3, discrete_actions(facts.actions))
 
 
+@pytest.mark.nightly
 def test_latency_curve_rises(tmp_path: Path) -> None:
     text = output_of("latency_curve.py", tmp_path)
     times = numbers_after(r"%\s+([\d.]+) s", text)
@@ -102,6 +107,7 @@ def test_latency_curve_rises(tmp_path: Path) -> None:
     assert len(times) == 3
 
 
+@pytest.mark.nightly
 def test_compare_runs(tmp_path: Path) -> None:
     text = output_of("compare_runs.py", tmp_path)
     changes = numbers_after(r"^\w+ +([+-][\d.]+) %  \[[+-].*\]  over (\d+) pairs$", text)
@@ -122,6 +128,7 @@ def test_conducted_program(tmp_path: Path) -> None:
     assert abs(down) < 0.2, "landed"
 
 
+@pytest.mark.nightly
 def test_mavsdk_client_flies_a_square(tmp_path: Path) -> None:
     ports = choose_ports()
     firmware_words = ["-m", "airl_mav.cli.firmware", "--arena", "open-field", *ports.options()]
@@ -135,6 +142,7 @@ def test_mavsdk_client_flies_a_square(tmp_path: Path) -> None:
     assert math.hypot(*corners[6:8]) < 12.0, "back near the start"
 
 
+@pytest.mark.nightly
 def test_own_camera_flies_to_the_goal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The companion with a driver of the user's, named by its file."""
     ports = choose_ports()

@@ -69,6 +69,7 @@ def test_what_becomes_of_a_mission(fault: str, outcome: Outcome, note: str) -> N
     assert [each.fault for each in record.faults] == [fault]
 
 
+@pytest.mark.nightly
 def test_a_run_folder_tells_its_faults_and_flies_them_again(tmp_path: Path) -> None:
     out = tmp_path / "run"
     console = Console(record=True, width=200)

@@ -183,6 +183,7 @@ def test_killed_companion_lets_the_failsafe_land(tmp_path: Path, ground: Ground)
     assert ground.height < 0.3
 
 
+@pytest.mark.nightly
 def test_a_flight_that_loses_its_companion_is_flown_again(tmp_path: Path, ground: Ground) -> None:
     """One that loses its firmware is flown again in test_campaign_faults.py."""
     ports = choose_ports(ground.port)
@@ -381,6 +382,7 @@ companion()
 """
 
 
+@pytest.mark.nightly
 def test_policy_that_holds_the_interpreter_ends_the_process(tmp_path: Path, ground: Ground) -> None:
     ports = choose_ports(ground.port)
     with firmware(tmp_path, ports) as vehicle:
@@ -751,6 +753,7 @@ def test_companion_interrupted_before_takeoff_stays_on_the_ground(
         assert max(height for _, _, height in ground.track) < 0.5
 
 
+@pytest.mark.nightly
 def test_companion_interrupted_in_flight_lands(tmp_path: Path, ground: Ground) -> None:
     ports = choose_ports(ground.port)
     with firmware(tmp_path, ports) as vehicle, companion(tmp_path, ports) as pilot:

@@ -105,6 +105,7 @@ def test_a_comparison_in_lines(tmp_path: Path) -> None:
     assert (last["done"], last["planned"]) == (4, 4)
 
 
+@pytest.mark.nightly
 def test_quiet_is_the_verdict_and_the_report(tmp_path: Path) -> None:
     out = tmp_path / "run"
     words = ["--out", str(out), "--episodes", "1", "--level", "lockstep", "--quiet"]
@@ -116,6 +117,7 @@ def test_quiet_is_the_verdict_and_the_report(tmp_path: Path) -> None:
     assert report == f"report  {out / 'report.html'}"
 
 
+@pytest.mark.nightly
 def test_an_interrupted_run_ends_its_lines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     real = EpisodeSaver.add
 

@@ -70,7 +70,7 @@ def expected_us(first_us: float, n: int) -> NDArray[np.float64]:
     return values[(start + np.arange(n)) % len(values)]
 
 
-@pytest.mark.parametrize("level", ["twin", "lockstep"])
+@pytest.mark.parametrize("level", ["twin", pytest.param("lockstep", marks=pytest.mark.nightly)])
 def test_the_trace_is_replayed_in_its_order(level: str, request: pytest.FixtureRequest) -> None:
     run = request.getfixturevalue(level)
     starts = set()

@@ -120,6 +120,7 @@ def test_a_flight_on_a_full_disk_goes_on_without_its_logs(
     assert ULog(str(tmp_path / "flight.ulg")).data_list
 
 
+@pytest.mark.nightly
 def test_reruns_under_load_are_the_same(
     scenario: ResolvedScenario, reference: FlownEpisode
 ) -> None:
@@ -175,6 +176,7 @@ def test_earlier_flights_leave_no_trace(
     assert flown(scenario).record == reference.record
 
 
+@pytest.mark.nightly
 def test_a_process_that_is_stopped_flies_the_same(reference: FlownEpisode) -> None:
     """SIGSTOP: MAVSDK's timers run out meanwhile, by the wall clock."""
     moments = np.random.default_rng(5)
@@ -292,7 +294,7 @@ FAILSAFES = [
     pytest.param(companion_dies, "Failsafe activated", None, marks=pytest.mark.nightly),
     (policy_hangs, "Landing", None),
     (nobody_takes_off, "auto preflight", None),
-    (battery_runs_low, "battery", 40.0),
+    pytest.param(battery_runs_low, "battery", 40.0, marks=pytest.mark.nightly),
 ]
 
 

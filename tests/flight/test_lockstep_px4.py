@@ -141,6 +141,7 @@ def test_a_flight_with_its_stand_in(tmp_path: Path, px4_instance: int) -> None:
     np.testing.assert_array_equal(t2_us, 1_000)
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_flight_that_loses_it_every_time(tmp_path: Path, px4_instance: int) -> None:
     build = write_build(tmp_path / "px4", "--fault", "die@1")

@@ -361,6 +361,7 @@ def test_simulator_that_ends_tells_the_companion(reference: Reference, tmp_path:
 # --- another language
 
 
+@pytest.mark.nightly
 def test_companion_of_the_documentation_flies_its_square(tmp_path: Path) -> None:
     """Nothing but pymavlink and a socket, as the documentation prints it; twice the same."""
     script = ROOT / "examples" / "lockstep_client.py"

@@ -279,6 +279,7 @@ def test_going_places_with_every_plugin(tmp_path: Path) -> None:
             mode(FlightMode.RETURN_TO_LAUNCH)
 
 
+@pytest.mark.nightly
 def test_refusals_in_the_air_and_hold(tmp_path: Path) -> None:
     with ground_station() as ground:
         ports = choose_ports(ground.port)

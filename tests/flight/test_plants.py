@@ -23,7 +23,10 @@ compared_with_pybullet = pytest.mark.skipif(not HAS_PYBULLET, reason="pybullet i
 
 
 @compared_with_pybullet
-@pytest.mark.parametrize(("arena", "seed"), [("static-obstacles", SEED), ("crowded", 3)])
+@pytest.mark.parametrize(
+    ("arena", "seed"),
+    [("static-obstacles", SEED), pytest.param("crowded", 3, marks=pytest.mark.nightly)],
+)
 def test_both_plants_fly_the_same_flight(arena: str, seed: int) -> None:
     """From standing to landing, decided from depth images, but for rounding: 1 mm is asked."""
     pair = compared(arena, arena, seed)

@@ -65,6 +65,7 @@ def setup(folder: Path) -> dict[str, Any]:
     return info["setup"]
 
 
+@pytest.mark.nightly
 def test_a_rehearsal_with_px4_that_dies_once(tmp_path: Path, px4_instance: int) -> None:
     """It dies in its first flight only; the rehearsal takes a new one, and says so."""
     healthy = write_build(tmp_path / "healthy")

@@ -323,9 +323,17 @@ def check(shown: Shown, row: Row, change: float, excused: tuple[str, ...]) -> No
     assert not differences(true, row.here, 0.0), (true, row.here)
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=() if n == "down 1" else pytest.mark.slow) for n in STEPS]
-)
+FAST_STEP = "down 1"
+EVERY_TIME = (FAST_STEP, "north 5", "yaw 90")
+"""One of each axis and kind; the others are flown in the night."""
+
+
+def _marks(name: str) -> list[pytest.MarkDecorator]:
+    marks = [] if name == FAST_STEP else [pytest.mark.slow]
+    return marks if name in EVERY_TIME else [*marks, pytest.mark.nightly]
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=_marks(n)) for n in STEPS])
 def test_steps_are_px4s(name: str) -> None:
     step = STEPS[name]
     up, down = fly(step)

@@ -53,6 +53,7 @@ def test_going_to_places_and_back_home() -> None:
         assert rig.said("RTL: land at destination") > rig.said("RTL: start return")
 
 
+@pytest.mark.nightly
 def test_a_return_waits_at_its_descend_altitude() -> None:
     """Near home the cone keeps it low: no climb; it waits at RTL_DESCEND_ALT, then lands."""
     parameters = {"RTL_RETURN_ALT": 30.0, "RTL_DESCEND_ALT": 4.0, "RTL_LAND_DELAY": 6.0}

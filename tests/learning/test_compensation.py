@@ -348,6 +348,7 @@ def test_an_untrained_for_latency_costs_little_once_it_is_compensated(tmp_path: 
     assert np.mean(reached[3]) >= np.mean(reached[0]) - 0.05
 
 
+@pytest.mark.nightly
 def test_one_flight_in_lockstep_is_the_same_twice() -> None:
     """Through estimator, MAVLink and MAVSDK; pipelined, its decisions follow each other."""
     resolved = demo_scenario(latency="200ms", compensate=True, decisions="pipelined")

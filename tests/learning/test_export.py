@@ -231,6 +231,7 @@ def test_exports_are_equal_and_name_no_path_of_this_machine(tmp_path: Path) -> N
             assert word not in data
 
 
+@pytest.mark.nightly
 def test_a_second_export_replaces_all_of_the_first(tmp_path: Path) -> None:
     export_tiny(tmp_path, with_torch=True)
     export_tiny(tmp_path, "PPO", name="other")

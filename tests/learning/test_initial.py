@@ -42,6 +42,7 @@ def weights(out: Path) -> dict[str, torch.Tensor]:
     return cast("dict[str, torch.Tensor]", found["policy"])
 
 
+@pytest.mark.nightly
 def test_begins_with_the_best_weights_of_a_run(before: Path, tmp_path: Path) -> None:
     # It ends before its first update: what it has is what it began with.
     for name, initial, same in (("on", before, True), ("afresh", None, False)):

@@ -223,6 +223,7 @@ def test_an_algorithm_that_cannot_choose_so_is_refused(parts: str, tmp_path: Pat
         train(validated(TrainingConfig, data), tmp_path / "run", name="mine")
 
 
+@pytest.mark.nightly
 def test_the_user_s_arena_is_flown_in_and_drawn(
     parts: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -35,6 +35,7 @@ def study(folder: Path, *options: str) -> list[str]:
     return [script, "--config", "small.toml", "--out", "out", *options]
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_it_times_what_is_missing_and_no_more(tmp_path: Path) -> None:
     with running(study(tmp_path), tmp_path) as process:

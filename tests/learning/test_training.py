@@ -174,6 +174,7 @@ def test_programs_read_lines(short: Path, tmp_path: Path) -> None:
     assert [line.split()[0] for line in text.splitlines()] == ["best", "policy", "folder"]
 
 
+@pytest.mark.nightly
 def test_folders_are_not_mixed_up(short: Path, straight: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="or resume"):
         airl("train", str(short), "--out", str(straight))

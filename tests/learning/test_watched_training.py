@@ -209,6 +209,7 @@ def test_a_training_that_goes_on_shows_whole_episodes() -> None:
     ends.close()
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here")
 @pytest.mark.xdist_group("chromium")

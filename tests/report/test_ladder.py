@@ -554,6 +554,7 @@ def interrupted_after(flights: int) -> Any:
     return patch.object(EpisodeSaver, "add", add)
 
 
+@pytest.mark.nightly
 def test_an_interrupted_ladder_goes_on(whole: tuple[Path, str], tmp_path: Path) -> None:
     out = tmp_path / "ladder"
     with interrupted_after(2 * EPISODES + 2):

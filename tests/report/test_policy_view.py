@@ -61,6 +61,7 @@ def test_the_policy_asked_again_chooses_what_it_flew(flown: LoadedRun) -> None:
     assert sum(map(bool, again)) >= 0.9 * len(again)
 
 
+@pytest.mark.nightly
 def test_so_it_does_where_its_latency_was_compensated(compensated: LoadedRun) -> None:
     decisions = seen_in(compensated)
     assert len(decisions) > 20

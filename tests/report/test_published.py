@@ -273,6 +273,7 @@ def test_a_table_of_a_script_is_taken_with_its_pictures(tmp_path: Path) -> None:
     assert set(found.made.policies) == {DEFAULT_POLICY}
 
 
+@pytest.mark.nightly
 def test_flying_writes_quick_results_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(flying, "RUNS", tmp_path / "runs")
     monkeypatch.setattr(flying, "RESULTS", tmp_path / "results")

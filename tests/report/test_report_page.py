@@ -167,6 +167,7 @@ def test_nothing_fails_nothing_is_asked_for_and_the_view_moves(page: Path) -> No
     assert re.fullmatch(r"-?\d+\.\d s · \d+\.\d m/s", found["clock"])
 
 
+@pytest.mark.nightly
 def test_a_phone_scrolls_down_and_not_sideways(page: Path) -> None:
     found = probe(page, (390, 844))
     assert found["window"] <= 500
@@ -180,6 +181,7 @@ def test_without_webgl_the_page_says_so(page: Path) -> None:
     assert found["missing"] == "block"
 
 
+@pytest.mark.nightly
 def test_light_and_dark_differ_and_paper_is_light(page: Path, tmp_path: Path) -> None:
     means = {}
     for name, extra in (

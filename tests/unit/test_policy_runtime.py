@@ -547,6 +547,7 @@ def test_onnx_flies_without_torch_and_without_a_word(exported: Path, tmp_path: P
     assert done.stdout + done.stderr == ""
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.xdist_group("flight")
 @pytest.mark.timeout(300)

@@ -31,6 +31,7 @@ STILL = np.zeros(0, np.int64)
 # --- intervals
 
 
+@pytest.mark.nightly
 def test_intervals_hold_the_truth_as_often_as_they_say_when_noise_lasts() -> None:
     """A line through noise that depends on its neighbours, 150 times: 95 % +- three deviations."""
     rng = np.random.default_rng(1)
