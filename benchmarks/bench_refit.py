@@ -3,9 +3,10 @@
     .venv/bin/python benchmarks/bench_refit.py [--flights 20] [--keep FOLDER] [--rehearsals 4]
 
 Flies aircraft in lockstep whose mass, thrust, drag, link, latency and wind are not those of the
-profile, recorded by the companion's black box and the vehicle's log, refits each from both and from
-the black box alone, and prints the errors. 20 flights take about two minutes. With --rehearsals
-each is flown again on its refit, as a whole and part by part: a minute or two more for each.
+profile, recorded by the companion's black box and the vehicle's log, refits each from both, from
+the black box alone and from the log alone, and prints the errors. 20 flights take about two
+minutes. With --rehearsals each is flown again on its refit, as a whole and part by part: a minute
+or two more for each.
 
 The true dead time is that of the same model on the simulator's own path, from when the flight
 controller took each setpoint: what no recording knows.
@@ -20,10 +21,13 @@ from pathlib import Path
 import numpy as np
 
 from airl_mav.experiments.refitted_reflight import PartFlown, refly_parts
-from airl_mav.refitting.refit import Refit, refit
+from airl_mav.refitting.refit import refit
 from airl_mav.scenario.model import DEFAULT_ARENA
 from tests.support.recorded_flights import RecordedFlight
 from tests.support.refit_truths import RefitErrors, drawn_truth, errors_of, true_dead_time_s
+
+BOTH, BOX, LOG = "both", "box", "log"
+"""What a refit is made from: black box and vehicle's log, or one of them alone."""
 
 ASKED = {"dead_s": 0.008, "mass": 0.03, "wind_m_s": 0.5, "t2": 0.02}
 """Errors that are asked for."""
@@ -37,23 +41,27 @@ def main() -> None:
     parser.add_argument("--rehearsals", type=int, default=0, help="of each flight, on its refit")
     asked = parser.parse_args()
     parts: dict[str, list[PartFlown]] = {}
-    rows: dict[str, list[RefitErrors]] = {"with the vehicle's log": [], "black box alone": []}
-    print("seed  log  dead ms  lag %  mass %  drag %  wind m/s  t2 %")
+    rows: dict[str, list[RefitErrors]] = {BOTH: [], BOX: [], LOG: []}
+    print("seed  from  dead ms  lag %  mass %  drag %  wind m/s  t2 %")
     with tempfile.TemporaryDirectory() as scratch:
         for seed in range(asked.first, asked.first + asked.flights):
             truth = drawn_truth(seed)
             folder = (asked.keep or Path(scratch)) / f"{seed:03d}"
             flight = truth.fly(folder)
             true_s = true_dead_time_s(flight)
-            for title, ulg in zip(rows, (flight.ulg, None), strict=True):
-                found: Refit = refit(flight.black_box, ulg=ulg)
-                if ulg and asked.rehearsals:
-                    _rehearse(flight, folder / "again", asked.rehearsals, parts)
-                errors = errors_of(found, truth, true_s, flight)
+            found = {
+                BOTH: refit(flight.black_box, ulg=flight.ulg),
+                BOX: refit(flight.black_box),
+                LOG: refit(flight.ulg),
+            }
+            if asked.rehearsals:
+                _rehearse(flight, folder / "again", asked.rehearsals, parts)
+            for title, each in found.items():
+                errors = errors_of(each, truth, true_s, flight)
                 rows[title].append(errors)
-                print(f"{seed:4d}  {'ulg' if ulg else '-':4s}{_row(errors)}  {flight.reason}")
+                print(f"{seed:4d}  {title:5s}{_row(errors)}  {flight.reason}")
     for title, errors_of_all in rows.items():
-        print(f"\n{title}:")
+        print(f"\nfrom {title}:")
         for name, bound in ASKED.items():
             _summary(name, bound, errors_of_all)
     for part, flown in parts.items():

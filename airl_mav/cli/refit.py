@@ -21,22 +21,27 @@ if TYPE_CHECKING:
 class RefitOptions(ProfileModel):
     """Fit a vehicle, a computer and the wind to a flight that --black-box has recorded.
 
-    With the flight controller's log (.ulg) also mass or thrust, and the time on the link. Writes
-    profiles that load as they are, and says what the flight does not tell.
+    With the flight controller's log (.ulg) also mass or thrust, and the time on the link. A PX4 log
+    alone, of whatever flew the vehicle, tells all of that but the computer. Writes profiles that
+    load as they are, and says what the flight does not tell.
 
     Examples:
+        airl refit log_12.ulg --vehicle quad --out refit
         airl refit flights/20261123T172437.230467Z.mcap --ulg log_12.ulg --out refit
         airl refly flights/20261123T172437.230467Z.mcap --refit refit
     """
 
-    flight: Annotated[Path, POSITIONAL] = Field(description="black box of a flight (.mcap)")
+    flight: Annotated[Path, POSITIONAL] = Field(
+        description="black box of a flight (.mcap), or the flight controller's log alone (.ulg)"
+    )
     ulg: Path | None = Field(
-        default=None, description="the flight controller's log of the same flight (.ulg)"
+        default=None,
+        description="the flight controller's log of the flight of a black box (.ulg)",
     )
     vehicle: str | None = Field(
         default=None,
         description="vehicle profile to refit: a shipped name, or a path to a .toml; by default the"
-        " one that the flight names",
+        " one that the black box names, quad for a log alone",
     )
     known: Literal["thrust", "mass"] = Field(
         default="thrust",

@@ -111,19 +111,18 @@ def write_refit(
         data: Of `refit.json`.
         vehicle: The vehicle's profile as TOML.
         computer: The computer's; None: none can be written.
-        samples_ms: t2 of the decisions.
+        samples_ms: t2 of the decisions; none: no latency is written.
         remarks: Where all this comes from.
 
     Raises:
         OSError: They cannot be written.
     """
     out.mkdir(parents=True, exist_ok=True)
-    write_samples(out / LATENCY_FILE, samples_ms, ("t2 of the decisions, ms", *remarks))
     replace_file(out / VEHICLE_FILE, vehicle.encode())
-    scenario: dict[str, Any] = {
-        "vehicle": str((out / VEHICLE_FILE).absolute()),
-        "latency": str((out / LATENCY_FILE).absolute()),
-    }
+    scenario: dict[str, Any] = {"vehicle": str((out / VEHICLE_FILE).absolute())}
+    if samples_ms:
+        write_samples(out / LATENCY_FILE, samples_ms, ("t2 of the decisions, ms", *remarks))
+        scenario["latency"] = str((out / LATENCY_FILE).absolute())
     if computer is not None:
         replace_file(out / COMPUTER_FILE, _commented(computer, remarks).encode())
     if data["wind"] is not None:

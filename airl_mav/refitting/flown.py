@@ -1,4 +1,4 @@
-"""What a refit looks at: a recorded flight, and the vehicle's log of it where there is one."""
+"""What a refit looks at: a recorded flight, the vehicle's log of it, or both."""
 
 from __future__ import annotations
 
@@ -14,47 +14,56 @@ from airl_mav.core.errors import UsageError
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.report.recorded_flight import NAVIGATING, path_of, stamps_of
 from airl_mav.vehicle_log.alignment import Alignment, align
-from airl_mav.vehicle_log.ulog import VehicleLog
+from airl_mav.vehicle_log.ulog import MOTORS, VehicleLog
 
 AIRBORNE_M = 0.8
 """Higher than this above where it stood, ground and its effect are far [m]."""
 
+LOGGED_PATH_US = 40_000
+"""Step of a path that is taken from a log [µs]: the rate of a companion's recording."""
+
+OFFBOARD = 14
+"""`vehicle_status.nav_state` of PX4's Offboard (NAVIGATION_STATE_OFFBOARD)."""
+
 
 @dataclass(frozen=True)
 class Flown:
-    """A recorded flight. Times are the companion's, but for those of the log."""
+    """A recorded flight.
 
-    box: BlackBox
+    Times are the companion's, but for those of the log; of a flight that only the log tells, they
+    are the log's as well.
+    """
+
     path: Trajectory
-    """As telemetry told it."""
-    stamps: dict[str, NDArray[np.int64]]
-    """Of the decisions, by column."""
+    """As telemetry told it, or the log."""
+    sent_us: NDArray[np.int64]
+    """(k,) when the setpoints were sent; of a log, when they are first in it [µs]."""
     setpoints: NDArray[np.float64]
-    """(k, 4) forward, right, down [m/s], yaw rate [rad/s]."""
+    """(k, 4) velocity [m/s], yaw rate [rad/s]: forward, right, down; of a log north, east, down."""
     navigation_us: int
-    """From when on the policy flew [µs]."""
+    """From when on velocity setpoints steered it [µs]."""
     ended_us: int
     """Until when [µs]."""
     airborne_us: tuple[int, int]
     """From when to when it was clear of the ground [µs]."""
     log: VehicleLog | None = None
     clocks: Alignment | None = None
-    """How the clocks relate; None without a log."""
+    """How the clocks of the companion and of the log relate; None without both."""
 
     @property
-    def sent_us(self) -> NDArray[np.int64]:
-        """(k,) when the setpoints were sent [µs]."""
-        return self.stamps["sent_us"]
+    def is_logged_only(self) -> bool:
+        """Whether the vehicle's log is all that there is."""
+        return self.log is not None and self.clocks is None
 
     def logged_us(self, time_us: float) -> float:
-        """Return the log's time of what was told at the companion's time [µs]."""
-        if self.clocks is None:
+        """Return the log's time of what was told at the flight's time [µs]."""
+        if self.log is None:
             raise ValueError("there is no log")
-        return time_us - self.clocks.told_us
+        return time_us if self.clocks is None else time_us - self.clocks.told_us
 
 
 def flown_of(box: BlackBox, log: VehicleLog | None) -> Flown:
-    """Return a flight with its log.
+    """Return a flight that a companion recorded, with the vehicle's log of it.
 
     Raises:
         UsageError: It holds no navigation, or the log is of another flight.
@@ -65,18 +74,17 @@ def flown_of(box: BlackBox, log: VehicleLog | None) -> Flown:
     if not begun or not decisions or len(path) < 2:
         raise UsageError(f"{box.path}: no decision was recorded; accepted: a flight that navigated")
     stamps = stamps_of(decisions)
-    setpoints = np.asarray(stamps.pop("setpoint"), np.float64)
+    sent_us, setpoints = stamps["sent_us"], np.asarray(stamps["setpoint"], np.float64)
     after = [
         each.time_us
         for each in box.all_of(Phase)
         if each.time_us >= begun[0] and each.phase != NAVIGATING
     ]
     ended_us = after[0] if after else int(path.time_us[-1])
-    clocks = None if log is None else align(path, log, stamps["sent_us"], setpoints)
+    clocks = None if log is None else align(path, log, sent_us, setpoints)
     return Flown(
-        box=box,
         path=path,
-        stamps=stamps,
+        sent_us=sent_us,
         setpoints=setpoints,
         navigation_us=begun[0],
         ended_us=ended_us,
@@ -84,6 +92,73 @@ def flown_of(box: BlackBox, log: VehicleLog | None) -> Flown:
         log=log,
         clocks=clocks,
     )
+
+
+def flown_by_log(log: VehicleLog) -> Flown:
+    """Return a flight that only the vehicle's log tells: its longest stretch off the ground.
+
+    Raises UsageError: it never left the ground, or is not that of a quadrotor.
+    """
+    rotors = log.parameters.get("CA_ROTOR_COUNT", MOTORS)
+    if rotors != MOTORS:
+        raise UsageError(f"{log.path}: CA_ROTOR_COUNT {rotors:g}: accepted: {MOTORS}, a quadrotor")
+    path = _logged_path(log)
+    ground_m = float(np.median(path.position[path.time_us < path.time_us[0] + US_PER_S, 2]))
+    high = path.position[:, 2] < ground_m - AIRBORNE_M
+    if not high.any():
+        raise UsageError(
+            f"{log.path}: never {AIRBORNE_M:g} m above where it began: accepted: a log of a flight"
+        )
+    start_us, end_us = (int(path.time_us[each]) for each in _longest(high))
+    sent_us, setpoints = _velocity_setpoints(log, start_us, end_us)
+    return Flown(
+        path=path,
+        sent_us=sent_us,
+        setpoints=setpoints,
+        navigation_us=int(sent_us[0]) if len(sent_us) else start_us,
+        ended_us=int(sent_us[-1]) if len(sent_us) else end_us,
+        airborne_us=(start_us, end_us),
+        log=log,
+    )
+
+
+def _logged_path(log: VehicleLog) -> Trajectory:
+    """Return the estimated path at `LOGGED_PATH_US`, between the samples of the log."""
+    first_us = max(int(each.time_us[0]) for each in (log.motion, log.attitude))
+    last_us = min(int(each.time_us[-1]) for each in (log.motion, log.attitude))
+    times_us = np.arange(first_us, last_us, LOGGED_PATH_US)
+    if len(times_us) < 2:
+        raise UsageError(f"{log.path}: position and attitude are not of the same time")
+    motion, turned = log.motion.at(times_us), log.attitude.at(times_us)
+    turned /= np.linalg.norm(turned, axis=1, keepdims=True)
+    return Trajectory(times_us, motion[:, :3], motion[:, 3:], turned, np.zeros(len(times_us)))
+
+
+def _velocity_setpoints(
+    log: VehicleLog, start_us: int, end_us: int
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return the longest row of setpoints by which velocity alone steered, as in `Flown`.
+
+    That is in Offboard, with neither a position nor an acceleration beside it: what a mode plans
+    smoothly, and feeds forward, does not show how long the vehicle takes to answer.
+    """
+    tracked = log.setpoint.between(start_us, end_us)
+    steered = np.isfinite(tracked.values[:, :3]).all(axis=1)
+    steered &= log.nav_state.newest(tracked.time_us)[:, 0] == OFFBOARD
+    beside = log.more_than_velocity.newest(tracked.time_us)
+    steered &= ~np.isfinite(beside).any(axis=1)
+    if not steered.any():
+        return np.zeros(0, np.int64), np.zeros((0, 4))
+    first, last = _longest(steered)
+    return tracked.time_us[first : last + 1], np.nan_to_num(tracked.values[first : last + 1])
+
+
+def _longest(holds: NDArray[np.bool_]) -> tuple[int, int]:
+    """Return the first and the last index of the longest row that holds; one does."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], holds, [False]]).astype(np.int8)))
+    starts, ends = edges[::2], edges[1::2]
+    longest = int(np.argmax(ends - starts))
+    return int(starts[longest]), int(ends[longest]) - 1
 
 
 def seconds(times_us: NDArray[np.int64], from_us: int) -> NDArray[np.float64]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,8 +12,8 @@ from scipy.stats import bootstrap
 from airl_mav.core.constants import US_PER_MS
 from airl_mav.latency.autocorrelation import integrated_time
 from airl_mav.latency.stamps import NO_STAMP
-from airl_mav.refitting.flown import Flown
 from airl_mav.refitting.quantity import LEVEL, RESAMPLES, FittedQuantity, unobserved
+from airl_mav.vehicle_log.alignment import Alignment
 
 LEAST = 5
 """Decisions below which a mean has no interval."""
@@ -32,14 +33,27 @@ class Latencies:
     """t2 of the decisions, in their order."""
 
 
-def fit_latencies(flown: Flown, rng: np.random.Generator) -> Latencies:
+def no_latencies() -> Latencies:
+    """Return what a vehicle's log alone tells of them: nothing."""
+    why = "a vehicle's log holds no decisions: give the black box"
+    return Latencies(
+        unobserved("t1_ms", "t1, mean", "ms", why, None),
+        unobserved("t2_ms", "t2, mean", "ms", why, None),
+        unobserved("link_ms", "link, both ways", "ms", why, None),
+        (),
+    )
+
+
+def fit_latencies(
+    stamps: Mapping[str, NDArray[np.int64]], clocks: Alignment | None, rng: np.random.Generator
+) -> Latencies:
     """Return the latencies of a flight's decisions.
 
     Args:
-        flown: The flight.
+        stamps: Of the decisions, by column.
+        clocks: How the companion's clock and the log's relate; None without a log.
         rng: Draws the resamples of the intervals.
     """
-    stamps = flown.stamps
     t2_us = stamps["action_ready_us"] - stamps["infer_start_us"]
     stamped = stamps["capture_us"] != NO_STAMP
     t1_us = (stamps["decoded_us"] - stamps["capture_us"])[stamped]
@@ -63,7 +77,7 @@ def fit_latencies(flown: Flown, rng: np.random.Generator) -> Latencies:
             "no decision was recorded",
             rng,
         ),
-        _link(flown),
+        _link(clocks),
         tuple(float(each) for each in samples_ms),
     )
 
@@ -91,9 +105,8 @@ def _mean(
     return FittedQuantity(key, meaning, "ms", mean, low, high, source)
 
 
-def _link(flown: Flown) -> FittedQuantity:
+def _link(clocks: Alignment | None) -> FittedQuantity:
     key, meaning = "link_ms", "link, both ways"
-    clocks = flown.clocks
     if clocks is None:
         why = "a black box knows neither end of it: give the vehicle's log"
         return unobserved(key, meaning, "ms", why, None)

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from airl_mav.black_box.messages import Decision
 from airl_mav.black_box.reading import BlackBox, read_black_box
-from airl_mav.core.constants import US_PER_MS
+from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.provenance import package_versions
 from airl_mav.profiles.computer import ComputerProfile, load_computer
@@ -18,16 +19,20 @@ from airl_mav.profiles.loaded import loaded
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from airl_mav.refitting.air import Air, fit_air
 from airl_mav.refitting.files import computer_profile, vehicle_toml, write_refit
-from airl_mav.refitting.flown import Flown, flown_of
-from airl_mav.refitting.latencies import Latencies, fit_latencies
+from airl_mav.refitting.flown import Flown, flown_by_log, flown_of
+from airl_mav.refitting.latencies import Latencies, fit_latencies, no_latencies
 from airl_mav.refitting.overrides import Override, overrides_of, refitted
 from airl_mav.refitting.quantity import FittedQuantity
 from airl_mav.refitting.response import ResponseFit, fit_response
 from airl_mav.refitting.thrust import Known, Thrust, fit_thrust
-from airl_mav.vehicle_log.ulog import read_vehicle_log
+from airl_mav.report.recorded_flight import stamps_of
+from airl_mav.vehicle_log.ulog import VehicleLog, read_vehicle_log
 
 SCHEMA = 1
 """Version of `refit.json`."""
+
+LOG_SUFFIX = ".ulg"
+"""Of a flight controller's log."""
 
 DEFAULT_COMPUTER = "workstation"
 """Stays on the ground: has no part in the vehicle's mass."""
@@ -37,7 +42,8 @@ DEFAULT_COMPUTER = "workstation"
 class Refit:
     """What a flight says of its vehicle, its computer and the wind."""
 
-    black_box: Path
+    black_box: Path | None
+    """None: only the vehicle's log tells of the flight."""
     ulg: Path | None
     base: str
     """Profile that was refitted: a shipped name, or a path."""
@@ -76,7 +82,7 @@ class Refit:
             del fields["key"]
         return {
             "schema": SCHEMA,
-            "black_box": str(self.black_box),
+            "black_box": None if self.black_box is None else str(self.black_box),
             "ulg": None if self.ulg is None else str(self.ulg),
             "vehicle": self.base,
             "known": self.known,
@@ -100,37 +106,44 @@ def refit(
     """Fit what a flight says of its vehicle, its computer and the wind.
 
     Args:
-        path: The black box.
-        ulg: The vehicle's own log of the flight; without it mass, thrust and link stay unknown.
-        vehicle: Profile to refit: a shipped name, or a path; None: the one that the flight names.
+        path: The black box; or a vehicle's log (.ulg) alone, of whatever flew it: that tells
+            nothing of the computer.
+        ulg: The vehicle's own log of the flight of a black box; without it mass, thrust and link
+            stay unknown.
+        vehicle: Profile to refit: a shipped name, or a path; None: the one that the black box
+            names, `quad` for a log alone.
         known: What the profile is right about: a flight tells only the greatest thrust per mass.
         out: New folder for `vehicle.toml`, `computer.toml`, `latency.txt`, `scenario.toml` and
             `refit.json`; None: nothing is written.
         seed: Draws the resamples of the intervals.
 
     Raises:
-        UsageError: A file cannot be read, or holds no navigation, or the log is of another flight.
-            `FieldError`s name the field.
+        UsageError: A file cannot be read, or holds no navigation, or the log is of another flight,
+            or alone and of none. `FieldError`s name the field.
     """
     if out is not None and out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise FieldError("out", f"{out}", "a new or empty folder: it holds something else")
-    box = read_black_box(path)
+    alone = path.suffix.lower() == LOG_SUFFIX
+    if alone and ulg is not None:
+        raise FieldError("ulg", f"{ulg}", f"nothing beside {path}, which is a log already")
+    box = None if alone else read_black_box(path)
+    ulg = path if alone else ulg
     log = None if ulg is None else read_vehicle_log(ulg)
-    config = box.run.get("config", {})
+    flown = _flown(box, log)
+    config = {} if box is None else box.run.get("config", {})
     base = vehicle or str(config.get("vehicle", "quad"))
     profile = load_vehicle(base)
     board, remarks = _board(str(config.get("computer", DEFAULT_COMPUTER)))
     flying = loaded(profile, board, Payload())
-    flown = flown_of(box, log)
-    rng = np.random.default_rng(seed)
-    streams = rng.spawn(4)
+    streams = np.random.default_rng(seed).spawn(4)
     air = fit_air(flown, flying, streams[0])
     thrust = fit_thrust(flown, flying, air, known, streams[1])
     response = fit_response(flown, profile.response, streams[2])
-    logged = {} if log is None else log.parameters
-    overrides = overrides_of(profile, flying, response, thrust, air, logged)
+    overrides = overrides_of(
+        profile, flying, response, thrust, air, {} if log is None else log.parameters
+    )
     found = Refit(
-        black_box=path,
+        black_box=None if box is None else path,
         ulg=ulg,
         base=base,
         known=known,
@@ -139,12 +152,21 @@ def refit(
         response=response,
         thrust=thrust,
         air=air,
-        latencies=fit_latencies(flown, streams[3]),
-        notes=(*remarks, *_notes(flown, board)),
+        latencies=no_latencies()
+        if box is None
+        else fit_latencies(stamps_of(box.all_of(Decision)), flown.clocks, streams[3]),
+        notes=(*remarks, *_notes(flown, box, board)),
     )
     if out is not None:
         _write(found, box, board, out)
     return found
+
+
+def _flown(box: BlackBox | None, log: VehicleLog | None) -> Flown:
+    if box is not None:
+        return flown_of(box, log)
+    assert log is not None  # noqa: S101 (one of the two is there)
+    return flown_by_log(log)
 
 
 def _board(name: str) -> tuple[ComputerProfile, tuple[str, ...]]:
@@ -156,8 +178,9 @@ def _board(name: str) -> tuple[ComputerProfile, tuple[str, ...]]:
         return load_computer(DEFAULT_COMPUTER), (note,)
 
 
-def _write(found: Refit, box: BlackBox, board: ComputerProfile, out: Path) -> None:
-    from_what = found.black_box.name + (f" and {found.ulg.name}" if found.ulg else "")
+def _write(found: Refit, box: BlackBox | None, board: ComputerProfile, out: Path) -> None:
+    sources = [each for each in (found.black_box, found.ulg) if each is not None]
+    from_what = " and ".join(each.name for each in sources)
     remarks = (f"airl refit {from_what}", *found.notes)
     samples_ms = found.latencies.samples_ms
     write_refit(
@@ -165,21 +188,29 @@ def _write(found: Refit, box: BlackBox, board: ComputerProfile, out: Path) -> No
         found.as_json(),
         vehicle_toml(
             found.base,
-            f"{found.base}, refitted to the flight {found.black_box.stem}",
+            f"{found.base}, refitted to the flight {sources[0].stem}",
             found.overrides,
             remarks,
         ),
-        computer_profile(box, board, len(samples_ms), f"airl refit {found.black_box.name}"),
+        None
+        if box is None
+        else computer_profile(box, board, len(samples_ms), f"airl refit {from_what}"),
         samples_ms,
         remarks,
     )
 
 
-def _notes(flown: Flown, board: ComputerProfile) -> tuple[str, ...]:
+def _notes(flown: Flown, box: BlackBox | None, board: ComputerProfile) -> tuple[str, ...]:
     notes = []
-    if not flown.box.whole:
+    if box is None:
+        start_us, end_us = flown.airborne_us
+        notes.append(
+            f"fitted to the longest stretch off the ground, {(end_us - start_us) / US_PER_S:.0f} s"
+            f" from {start_us / US_PER_S:.1f} s on in the log"
+        )
+    if box is not None and not box.whole:
         notes.append("the recording ends early: only what it holds was fitted")
-    if flown.box.damaged:
+    if box is not None and box.damaged:
         notes.append("the recording is damaged: its checksum is wrong")
     if flown.clocks is not None:
         clocks = flown.clocks
@@ -189,8 +220,8 @@ def _notes(flown: Flown, board: ComputerProfile) -> tuple[str, ...]:
             f" {clocks.error_m_s:.3f} m/s"
         )
     if flown.log is not None and len(flown.log.wind):
-        start_us, end_us = (flown.logged_us(each) for each in flown.airborne_us)
-        told = flown.log.wind.between(start_us, end_us)
+        first_us, last_us = (flown.logged_us(each) for each in flown.airborne_us)
+        told = flown.log.wind.between(first_us, last_us)
         if len(told):
             north, east = told.values.mean(axis=0)
             notes.append(

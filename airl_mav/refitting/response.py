@@ -38,6 +38,9 @@ DIFFERENCES = (0.02, 0.02, 0.02)
 """Steps of the numerical derivatives, as shares: the model is piecewise linear in the dead time."""
 
 LEAST_DECISIONS = 8
+NORMAL_95 = 1.96
+"""Half width of a 95 % interval, in standard deviations."""
+
 WIDEST_S, WIDEST_SHARE = 0.05, 0.4
 """A dead time that is known no better, or a time constant, is not observable."""
 
@@ -74,7 +77,7 @@ class _Driven:
     grid_s: Array
     """(m,) steps of the model [s]."""
     commands: Array
-    """(m, 4) setpoint that was the newest to be sent."""
+    """(m, 4) setpoint that was the newest to be sent, as in `Flown`."""
     heading: Array
     """(m,) that was flown [rad], without jumps."""
     times_s: Array
@@ -136,13 +139,30 @@ def _describe(
 
 
 def _too_little(flown: Flown) -> str | None:
+    if flown.is_logged_only and not len(flown.sent_us):
+        return "the log holds no flight by velocity setpoints in Offboard"
     if len(flown.sent_us) < LEAST_DECISIONS:
         return f"{len(flown.sent_us)} decisions; {LEAST_DECISIONS} are needed"
-    change = np.diff(flown.setpoints[:, :2], axis=0)
-    rms = float(np.sqrt(np.mean(np.sum(change**2, axis=1))))
+    rms = _rms(_changes(flown)[:, :2])
     if rms < LEAST_CHANGE_M_S:
         return f"setpoints change by {rms:.2f} m/s; {LEAST_CHANGE_M_S:g} are needed"
     return None
+
+
+def _changes(flown: Flown) -> Array:
+    """Return by how much the setpoints change, (n, 4).
+
+    A companion's from one decision to the next; a log has the same setpoint many times, so from
+    their mean.
+    """
+    if flown.is_logged_only:
+        return np.asarray(flown.setpoints - flown.setpoints.mean(axis=0))
+    return np.diff(flown.setpoints, axis=0)
+
+
+def _rms(vectors: Array) -> float:
+    """Return the root mean square length of vectors (n, k)."""
+    return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))
 
 
 def _driven(flown: Flown) -> _Driven:
@@ -174,16 +194,17 @@ def _velocity(
 ) -> tuple[FittedQuantity, FittedQuantity]:
     """Fit dead time and time constant to the velocities north and east together.
 
-    A third parameter is the time at which the heading turned the setpoint: that of its arrival,
-    which is before the answer.
+    Where the setpoints are those of the companion, a third parameter is the time at which the
+    heading turned them: that of their arrival, which is before the answer. A log has them turned.
     """
     grid = driven.grid_s
 
     def residuals(of: Array) -> Array:
         dead_s, lag_s, turned_s = of
         forward, right = (np.interp(grid - dead_s, grid, driven.commands[:, k]) for k in (0, 1))
-        nose = np.exp(1j * np.interp(grid - turned_s, grid, driven.heading))
-        wanted = (forward + 1j * right) * nose
+        wanted = forward + 1j * right
+        if not flown.is_logged_only:
+            wanted = wanted * np.exp(1j * np.interp(grid - turned_s, grid, driven.heading))
         model = _lagged(wanted, lag_s, complex(*driven.begun_m_s))
         at = (
             np.interp(driven.times_s, grid, model.real),
@@ -208,6 +229,17 @@ def _link_share(flown: Flown) -> tuple[float, float, str]:
 
     With how unsure that is (95 %), and where it comes from.
     """
+    if flown.is_logged_only:
+        # A change is first seen in the sample after it: half their distance later, on the mean.
+        step_s = float(np.median(np.diff(flown.sent_us))) / US_PER_S
+        changed = int(np.count_nonzero(np.any(np.diff(flown.setpoints, axis=0), axis=1)))
+        unsure_s = NORMAL_95 * step_s / math.sqrt(12.0 * max(changed, 1))
+        return (
+            -0.5 * step_s,
+            unsure_s,
+            "setpoints and velocity in the vehicle's log"
+            f" (a setpoint is logged every {1e3 * step_s:.0f} ms, half of it is added)",
+        )
     clocks = flown.clocks
     if clocks is not None and clocks.accepted_range_us is not None:
         low_us, high_us = clocks.accepted_range_us
@@ -230,8 +262,7 @@ def _yaw_rate(
     driven: _Driven, flown: Flown, known: FittedQuantity, rng: np.random.Generator
 ) -> FittedQuantity:
     """Fit the time constant of the yaw rate to the heading, with a dead time of its own."""
-    change = np.diff(flown.setpoints[:, 3])
-    rms = float(np.sqrt(np.mean(change**2)))
+    rms = _rms(_changes(flown)[:, 3:])
     if rms < LEAST_CHANGE_RAD_S:
         why = f"yaw rates change by {rms:.2f} rad/s; {LEAST_CHANGE_RAD_S:g} are needed"
         return replace(known, unobservable=why)

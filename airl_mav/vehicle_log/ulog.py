@@ -35,6 +35,7 @@ _TOPICS = (
     "vehicle_attitude_setpoint",
     "vehicle_local_position",
     "vehicle_local_position_setpoint",
+    "vehicle_status",
     "wind",
 )
 
@@ -69,6 +70,13 @@ class Series:
         columns = [np.interp(times_us, self.time_us, column) for column in self.values.T]
         return np.stack(columns, axis=1)
 
+    def newest(self, times_us: NDArray[Any]) -> Floats:
+        """Return the values (m, k) that held at times (m,) [µs]; NaN before the first."""
+        if not len(self):
+            return np.full((len(times_us), self.values.shape[1]), np.nan)
+        newest = np.searchsorted(self.time_us, times_us, side="right") - 1
+        return np.where(newest[:, None] >= 0, self.values[np.maximum(newest, 0)], np.nan)
+
     def between(self, start_us: float, end_us: float) -> Series:
         """Return the samples from `start_us` to `end_us` [µs]."""
         inside = (self.time_us >= start_us) & (self.time_us <= end_us)
@@ -99,6 +107,11 @@ class VehicleLog:
     """Velocity that is tracked, north, east, down [m/s], and yaw rate [rad/s]."""
     yaw_rate_setpoint: Series
     """Yaw rate that is tracked [rad/s]; logged more often than `setpoint`."""
+    more_than_velocity: Series
+    """Position and acceleration that are commanded beside a velocity, NaN where none is: north,
+    east, down [m], then [m/s²]."""
+    nav_state: Series
+    """Mode, as `vehicle_status` numbers them."""
     battery: Series
     """Voltage [V], current [A], charge that is left 1 to 0."""
     wind: Series
@@ -139,6 +152,12 @@ def read_vehicle_log(path: Path) -> VehicleLog:
         yaw_rate_setpoint=_known(
             _series(topics, "vehicle_attitude_setpoint", ("yaw_sp_move_rate",))
         ),
+        more_than_velocity=_series(
+            topics,
+            "trajectory_setpoint",
+            (*_numbered("position", 3), *_numbered("acceleration", 3)),
+        ),
+        nav_state=_series(topics, "vehicle_status", ("nav_state",)),
         battery=_series(topics, "battery_status", ("voltage_v", "current_a", "remaining")),
         wind=_known(_series(topics, "wind", ("windspeed_north", "windspeed_east"))),
         parameters={name: float(value) for name, value in read.initial_parameters.items()},

@@ -107,7 +107,7 @@ def true_dead_time_s(flight: RecordedFlight) -> tuple[float, float] | None:
     true = replace(
         flown,
         path=path,
-        stamps={**flown.stamps, "sent_us": setpoints["accepted_us"][new]},
+        sent_us=setpoints["accepted_us"][new],
         setpoints=np.asarray(setpoints["setpoint"][new], np.float64),
     )
     fit = fit_response(true, None, np.random.default_rng(0))
@@ -169,7 +169,7 @@ def errors_of(
     if sampler is None:
         raise AssertionError("in lockstep latency is always injected")
     drawn_us = [sampler.sample_us() for _ in found.latencies.samples_ms]
-    injected_ms = float(np.mean(drawn_us)) / US_PER_MS
+    injected_ms = float(np.mean(drawn_us)) / US_PER_MS if drawn_us else math.nan
     return RefitErrors(
         dead_s=error("dead_s", "dead_time_s", dead_s, share=False),
         lag=error("lag", "velocity_time_s", lag_s),

@@ -10,7 +10,6 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from airl_mav.black_box.reading import BlackBox
 from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.flight.trajectory import Trajectory
@@ -71,10 +70,7 @@ def test_marzullo_finds_what_most_ranges_hold() -> None:
 
 def flown(path: Trajectory, sent_us: np.ndarray, setpoints: np.ndarray) -> Flown:
     ended_us = int(path.time_us[-1])
-    stamps = {"sent_us": sent_us.astype(np.int64)}
-    return Flown(
-        BlackBox(Path("made-up.mcap"), {}), path, stamps, setpoints, 0, ended_us, (0, ended_us)
-    )
+    return Flown(path, sent_us.astype(np.int64), setpoints, 0, ended_us, (0, ended_us))
 
 
 def path_of(times: np.ndarray, velocity: np.ndarray, quaternion: np.ndarray) -> Trajectory:
