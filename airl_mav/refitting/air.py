@@ -121,7 +121,7 @@ def fit_air(flown: Flown, vehicle: VehicleProfile, rng: np.random.Generator) -> 
     quadratic_1_m = vehicle.drag.quadratic_n_s2_m2 / mass_kg
     known = vehicle.drag.linear_n_s_m / mass_kg
     bias_m_s2 = vehicle.sensors.imu.accel_bias_m_s2
-    source = "lean and acceleration in telemetry"
+    source = f"lean and acceleration in {flown.told_by}"
     rows = _rows(flown, bias_m_s2)
     if rows is None:
         return _nothing("the flight is too short", known, quadratic_1_m)

@@ -55,6 +55,11 @@ class Flown:
         """Whether the vehicle's log is all that there is."""
         return self.log is not None and self.clocks is None
 
+    @property
+    def told_by(self) -> str:
+        """What tells its motion, for people."""
+        return "the vehicle's log" if self.is_logged_only else "telemetry"
+
     def logged_us(self, time_us: float) -> float:
         """Return the log's time of what was told at the flight's time [µs]."""
         if self.log is None:

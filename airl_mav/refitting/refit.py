@@ -188,7 +188,7 @@ def _write(found: Refit, box: BlackBox | None, board: ComputerProfile, out: Path
         found.as_json(),
         vehicle_toml(
             found.base,
-            f"{found.base}, refitted to the flight {sources[0].stem}",
+            f"{found.base}, refitted to {sources[0].stem}",
             found.overrides,
             remarks,
         ),

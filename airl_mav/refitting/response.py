@@ -220,7 +220,7 @@ def _velocity(
     low_s, high_s = (math.hypot(end, unsure_s) for end in ends[:, 0])
     value = float(found.x[0]) - shift_s
     dead = replace(dead, value=value, low=value - low_s, high=value + high_s, source=source)
-    lag = _with_interval(lag, float(found.x[1]), ends[:, 1], "velocity in telemetry")
+    lag = _with_interval(lag, float(found.x[1]), ends[:, 1], f"velocity in {flown.told_by}")
     return _known_to(dead, WIDEST_S), _known_to(lag, max(WIDEST_S, WIDEST_SHARE * found.x[1]))
 
 
@@ -277,7 +277,7 @@ def _yaw_rate(
     starts = [(dead_s, 0.1, float(driven.turned[0])) for dead_s in DEAD_TIMES_S]
     found = _best(residuals, starts, high=(2.0, 5.0, math.inf), free=2)
     ends = block_intervals(found.jac, found.fun, driven.times_s, rng)
-    fitted = _with_interval(known, float(found.x[1]), ends[:, 1], "heading in telemetry")
+    fitted = _with_interval(known, float(found.x[1]), ends[:, 1], f"heading in {flown.told_by}")
     return _known_to(fitted, max(WIDEST_S, WIDEST_SHARE * found.x[1]))
 
 
