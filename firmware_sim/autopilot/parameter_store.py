@@ -60,6 +60,8 @@ class Parameters:
         self.value: Callable[[str], float] = self._flown.__getitem__
         """Returns a value as it is flown; fast enough for flight code that asks at every tick.
         Raises KeyError if the name is unknown."""
+        self.revision = 0
+        """Another number after each change of a value, the same until then."""
         self._listeners: list[Callable[[], None]] = []
         self._bounded: set[str] = {name for name in values if self._is_bounded(name)}
         """Parameters whose stored value is flown bounded, and said to be."""
@@ -161,6 +163,7 @@ class Parameters:
         if isinstance(stored, int) and not _INT32_LOW <= stored <= _INT32_HIGH:
             return False
         self._values[index] = stored
+        self.revision += 1
         self._flown[name] = spec.flown(stored)
         if not self._is_bounded(name):
             self._bounded.discard(name)

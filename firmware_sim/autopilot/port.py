@@ -31,9 +31,18 @@ class ParameterValue:
 class ParameterStore(Protocol):
     """PX4-named parameters."""
 
+    def __hash__(self) -> int:
+        """Tell it from others: two stores are never the same."""
+        ...
+
     @property
     def value(self) -> Callable[[str], float]:
         """Looks a value up as it is flown: within bounds. Raises KeyError for an unknown name."""
+        ...
+
+    @property
+    def revision(self) -> int:
+        """Another number after each change of a value, the same until then."""
         ...
 
     def __len__(self) -> int:

@@ -10,6 +10,8 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
+from firmware_sim.autopilot.parameter_store import Parameters as Stored
+from firmware_sim.mavlink.services.params import _hash_message
 from tests.support.kinematic_autopilot import DEFAULT_PARAMETERS, KinematicAutopilot, Parameters
 from tests.support.mavlink_clients import CLIENT_IDS, Rig
 
@@ -105,6 +107,19 @@ def test_the_full_list_is_paced_and_complete() -> None:
     assert values[0].param_index == 65_535
     assert [v.param_index for v in values[1:]] == list(range(100))
     assert {v.param_count for v in values} == {100}
+
+
+def test_the_hash_is_another_after_every_change() -> None:
+    """With the flight controller's own store: the hash is worked out once for all who begin."""
+    store = Stored()
+    before = _hash_message(store)
+    assert _hash_message(store) == before
+    store.set("MPC_XY_VEL_MAX", 7.0)
+    changed = _hash_message(store)
+    assert changed != before
+    store.reset()
+    assert _hash_message(store) == before
+    assert _hash_message(Stored({"MPC_XY_VEL_MAX": 7.0})) == changed
 
 
 def px4_crc32part(data: bytes, crc: int) -> int:

@@ -67,6 +67,10 @@ class Parameters:
         return (defaults | self.values).__getitem__
 
     @property
+    def revision(self) -> int:
+        return hash(tuple(self.values.items()))
+
+    @property
     def _names(self) -> list[str]:
         return sorted(self.values)
 

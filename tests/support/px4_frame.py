@@ -56,4 +56,5 @@ class Px4Parameters(Parameters):
         if name not in self._more:
             return super().set(name, value)
         self._more[name] = type(self._more[name])(value)
+        self.revision += 1
         return self.by_name(name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import struct
 
@@ -116,9 +117,15 @@ def _value_message(parameter: ParameterValue, count: int) -> tuple[str, bytes]:
 
 
 def _hash_message(store: ParameterStore) -> tuple[str, bytes]:
-    digest = struct.pack("<I", parameter_hash(store))
+    digest = struct.pack("<I", _hash_of(store, store.revision))
     kind = dialect.MAV_PARAM_TYPE_UINT32
     return "PARAM_VALUE", param_value(HASH_NAME, digest, kind, len(store), _NO_INDEX)
+
+
+@functools.lru_cache(maxsize=1)
+def _hash_of(store: ParameterStore, _revision: int) -> int:
+    """Return `parameter_hash`, which takes most of a tick, once for all clients that begin."""
+    return parameter_hash(store)
 
 
 def parameter_hash(store: ParameterStore) -> int:
