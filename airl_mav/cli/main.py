@@ -39,6 +39,7 @@ SUBCOMMANDS: dict[str, str] = {
     "refly": "rehearse a flight that was recorded, and compare the two",
     "render": "what a colour camera sees: an arena as a picture, a flight as a film",
     "arena": "look at an arena, or at what its profile draws",
+    "asset": "an arena whose obstacles are a mesh of yours (STL, OBJ, GLB)",
     "parameters": "a vehicle's parameters as a file for firmware that you start",
     "conformance": "does a flight controller do what the rehearsal assumes?",
     "computers": "computer profiles: what each was timed with, by whom, and how late it decides",

@@ -352,6 +352,7 @@ EXTRAS = {
     "black-box": ("mcap",),
     "export": ("foxglove", "mcap"),
     "film": ("av",),
+    "mesh": ("trimesh",),
     "profile": ("onnx",),
     "refit": ("mcap", "pyulog"),
     "render": ("mitsuba",),

@@ -19,8 +19,8 @@ OBSTACLES = "obstacles"
 GeneratorName = Annotated[str, part_name(GENERATORS, (OBSTACLES,))]
 Option = bool | int | float | str | list[int | float | str]
 
-_ASSET_NAME = re.compile("[a-z]+(-[a-z]+)*")
-"""What is hit is called after it."""
+ASSET_NAME = re.compile("[a-z]+(-[a-z]+)*")
+"""What things of the user's may be called: what is hit is called after it."""
 
 SPHERE_OFFSET = 0.5
 """A sphere's centre is at most this share of its radius off the flight altitude."""
@@ -242,7 +242,7 @@ class ArenaSpec(ProfileModel):
 
     def _check_assets(self) -> None:
         for name, asset in self.assets.items():
-            if name in SHAPES or _ASSET_NAME.fullmatch(name) is None:
+            if name in SHAPES or ASSET_NAME.fullmatch(name) is None:
                 raise ValueError(
                     f"assets.{name}: accepted: a name of small letters, with dashes between words,"
                     f" but {', '.join(SHAPES)}"

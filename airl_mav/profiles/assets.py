@@ -14,6 +14,9 @@ from pydantic import Field
 
 from airl_mav.core.fields import ProfileModel, quantity
 
+MOST_PARTS = 128
+"""Parts of one asset: every ray and every contact looks at each."""
+
 
 class _Placed(ProfileModel):
     """Where a part is, seen from the place of the asset on the floor."""
@@ -91,7 +94,7 @@ Part = Annotated[BoxPart | CylinderPart | SpherePart, Field(discriminator="shape
 class Asset(ProfileModel):
     """One thing, made of parts that keep their places in it."""
 
-    parts: Annotated[tuple[Part, ...], Field(min_length=1, max_length=32)] = Field(
+    parts: Annotated[tuple[Part, ...], Field(min_length=1, max_length=MOST_PARTS)] = Field(
         description="boxes, cylinders and spheres, each with its shape, place and size"
     )
 

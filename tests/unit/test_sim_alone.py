@@ -9,7 +9,7 @@ import pytest
 from tests.support.processes import run_alone
 
 OF_OTHER_EXTRAS = (
-    *("mcap", "pyulog", "foxglove", "viser", "mitsuba", "cyclonedds", "rosbags", "ray"),
+    *("mcap", "pyulog", "foxglove", "viser", "trimesh", "mitsuba", "cyclonedds", "rosbags", "ray"),
     *("gymnasium", "stable_baselines3", "sb3_contrib", "torch", "onnx", "pyrealsense2", "depthai"),
 )
 """Packages of extras that no flight needs, by the name that is imported."""

@@ -1,0 +1,223 @@
+"""An asset from a mesh: boxes along its axes that cover its surface.
+
+Cameras, contacts, planners and renderers know boxes, cylinders and spheres, so a mesh becomes
+boxes: it is cut into cubic cells, those that its surface passes through are taken, a closed one is
+filled, and neighbouring cells are joined. What is covered is no less than the mesh, and at most the
+diagonal of one cell more.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import permutations, product
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy.ndimage import binary_fill_holes
+
+from airl_mav.core.errors import FieldError, UsageError
+from airl_mav.profiles.assets import MOST_PARTS, Asset, BoxPart
+
+Up = Literal["auto", "y", "z"]
+"""Which axis of the file points up."""
+
+Y_UP = (".glb", ".gltf")
+"""Formats whose specification says that y points up."""
+
+FORMATS = (".stl", ".obj", ".glb", ".gltf", ".ply", ".off")
+
+COARSEST, FINEST = 1.0, 1 / 48
+"""Cells that are tried, as shares of the longest side."""
+
+FINER = 0.88
+"""Factor from one size of cells to the next."""
+
+EDGE_SHARE = 0.5
+"""Edges of the triangles that the surface is cut into, as a share of a cell."""
+
+MOST_CUTS = 20
+"""So often an edge is halved at most."""
+
+PATIENCE = 3
+"""So many sizes in a row that take too many boxes end the search: finer ones take more, mostly."""
+
+LEAST_M, GREATEST_M = 0.01, 20.0
+"""Least side of a part and longest side of an asset [m]."""
+
+_Y_TO_Z = np.array([[1, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]], np.float64)
+"""A quarter turn about x: y up becomes z up."""
+
+Cells = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class MeshBoxes:
+    """A mesh as an asset."""
+
+    asset: Asset
+    cell_m: float
+    """Edge of the cells [m]."""
+    size_m: tuple[float, float, float]
+    """Of the mesh: forward, right, up [m]."""
+    closed: bool
+    """Whether it has an inside, which is filled."""
+
+    @property
+    def beyond_m(self) -> float:
+        """How far the boxes reach beyond the mesh at most [m]."""
+        return math.sqrt(3.0) * self.cell_m + EDGE_SHARE * self.cell_m
+
+
+def boxes_of_mesh(
+    path: Path, *, most: int = MOST_PARTS, scale: float = 1.0, up: Up = "auto"
+) -> MeshBoxes:
+    """Return a mesh as an asset of boxes, with the finest cells that take no more boxes.
+
+    The mesh is put with the middle of its footprint on the asset's place and its lowest point on
+    the floor; its x axis is the asset's forward axis.
+
+    Args:
+        path: An STL, OBJ, GLB, glTF, PLY or OFF file.
+        most: Greatest number of boxes, 1 to `MOST_PARTS`.
+        scale: Metres per unit of the file.
+        up: Axis of the file that points up; "auto": y for GLB and glTF, else z.
+
+    Raises:
+        UsageError: The file cannot be read, holds no surface, or is too large for an asset.
+    """
+    mesh = _read(path)
+    if up == "y" or (up == "auto" and path.suffix.lower() in Y_UP):
+        mesh.apply_transform(_Y_TO_Z)
+    # From x forward, y left, z up to forward, right, up.
+    mesh.apply_transform(np.diag((scale, -scale, scale, 1.0)))
+    low, high = (np.asarray(each, np.float64) for each in mesh.bounds)
+    size = high - low
+    if not 0.0 < float(size.max()) <= GREATEST_M:
+        sides = " x ".join(f"{side:.3g}" for side in size)
+        raise FieldError(
+            "mesh", str(path), f"at most {GREATEST_M:g} m a side, not {sides} m (see --scale)"
+        )
+    mesh.apply_translation((*-0.5 * (low + high)[:2], -low[2]))
+    closed = bool(mesh.is_watertight)
+    cell_m, parts = _finest(mesh, float(size.max()), closed, most)
+    forward, right, height = map(float, size)
+    return MeshBoxes(Asset(parts=parts), cell_m, (forward, right, height), closed)
+
+
+def _finest(
+    mesh: trimesh.Trimesh, side_m: float, closed: bool, most: int
+) -> tuple[float, tuple[BoxPart, ...]]:
+    """Return the edge of the finest cells that take no more than `most` boxes, and these."""
+    # One box around the mesh always covers it.
+    low, high = (np.asarray(each, np.float64) for each in mesh.bounds)
+    found: tuple[float, tuple[BoxPart, ...]] = side_m, (_box(low, high),)
+    vertices, faces = mesh.vertices, mesh.faces
+    failed, share = 0, COARSEST
+    while share >= FINEST and failed < PATIENCE:
+        cell_m = share * side_m
+        vertices, faces = trimesh.remesh.subdivide_to_size(  # type: ignore[no-untyped-call]
+            vertices, faces, EDGE_SHARE * cell_m, max_iter=MOST_CUTS
+        )
+        cells, corner = _cells(np.asarray(vertices, np.float64), cell_m, closed)
+        boxes = joined(cells, most)
+        if boxes is None:
+            failed += 1
+        else:
+            failed = 0
+            found = cell_m, tuple(_box(corner + cell_m * a, corner + cell_m * b) for a, b in boxes)
+        share *= FINER
+    return found
+
+
+def joined(cells: Cells, most: int) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]] | None:
+    """Return boxes that are exactly the cells that are set, first and one past the last of each.
+
+    Each begins at the first cell that no box has, and is the largest of those that grow along the
+    three axes one after the other, in any order. None: there would be more than `most`.
+    """
+    left = cells.copy()
+    boxes: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []
+    while left.any():
+        if len(boxes) >= most:
+            return None
+        first = np.array(np.unravel_index(int(left.argmax()), left.shape), np.int64)
+        ends = [_grown(left, first, order) for order in permutations(range(3))]
+        end = max(ends, key=lambda each: int(np.prod(each - first)))
+        left[tuple(map(slice, first, end))] = False
+        boxes.append((first, end))
+    return boxes
+
+
+def _grown(left: Cells, first: NDArray[np.int64], order: tuple[int, ...]) -> NDArray[np.int64]:
+    """Return one past the last cell of a box that grows from its first along axes in an order."""
+    end = first + 1
+    for axis in order:
+        begin = first.copy()
+        while end[axis] < left.shape[axis]:
+            begin[axis] = end[axis]
+            further = end.copy()
+            further[axis] += 1
+            if not left[tuple(map(slice, begin, further))].all():
+                break
+            end = further
+    return end
+
+
+def _read(path: Path) -> trimesh.Trimesh:
+    if path.suffix.lower() not in FORMATS:
+        raise FieldError("mesh", str(path), f"a file that ends in {', '.join(FORMATS)}")
+    try:
+        mesh = trimesh.load(path, force="mesh")
+    except OSError as error:
+        raise UsageError(f"{path}: {error.strerror}") from None
+    except Exception as error:  # what its readers raise for a damaged file is their own
+        raise UsageError(f"{path}: cannot be read as a mesh: {error}") from None
+    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+        raise UsageError(f"{path}: holds no triangles")
+    if not np.isfinite(mesh.vertices).all():
+        raise UsageError(f"{path}: has places that are no numbers")
+    return mesh
+
+
+def _cells(
+    corners: NDArray[np.float64], cell_m: float, closed: bool
+) -> tuple[Cells, NDArray[np.float64]]:
+    """Return the cells (a, b, c) that a mesh fills, and the corner of the first (3,) [m].
+
+    `corners` (n, 3) are those of triangles with edges of at most e, `EDGE_SHARE` of a cell, no
+    point of which is further from a corner than e / sqrt(3). So the cells that the cubes around
+    all corners touch, which reach that far to each side, hold all of the surface.
+    """
+    reach_m = EDGE_SHARE * cell_m / math.sqrt(3.0)
+    first = corners.min(axis=0) - reach_m
+    size = np.ptp(corners, axis=0) + 2.0 * reach_m
+    cells = np.zeros(np.ceil(size / cell_m).astype(np.int64), np.bool_)
+    for sides in product((-reach_m, reach_m), repeat=3):
+        at = np.floor((corners + sides - first) / cell_m).astype(np.int64)
+        at = np.clip(at, 0, np.array(cells.shape) - 1)  # rounding at the last face
+        cells[tuple(at.T)] = True
+    return (binary_fill_holes(cells) if closed else cells), first
+
+
+def _box(low: NDArray[np.float64], high: NDArray[np.float64]) -> BoxPart:
+    """Return a box between two corners (3,) [m]; nothing is below the floor."""
+    least, most = low.copy(), high.copy()
+    least[2], most[2] = max(float(least[2]), 0.0), max(float(most[2]), LEAST_M)
+    middle, size = 0.5 * (least + most), np.maximum(most - least, LEAST_M)
+    return BoxPart(
+        shape="box",
+        forward_m=_round(middle[0]),
+        right_m=_round(middle[1]),
+        bottom_m=_round(least[2]),
+        length_m=_round(size[0]),
+        width_m=_round(size[1]),
+        height_m=_round(size[2]),
+    )
+
+
+def _round(value: float) -> float:
+    return round(float(value), 4)

@@ -1,0 +1,128 @@
+"""`airl asset`: an arena with a thing of the user's, from its mesh."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tomli_w
+from pydantic import Field
+from rich.console import Console
+
+from airl_mav.cli.options import POSITIONAL
+from airl_mav.core.console import new_console
+from airl_mav.core.errors import FieldError
+from airl_mav.core.fields import ProfileModel, quantity
+from airl_mav.core.files import replace_file
+from airl_mav.profiles.arena import ASSET_NAME, SHAPES, ArenaSpec
+from airl_mav.profiles.assets import MOST_PARTS
+from airl_mav.profiles.loading import load_profile
+from airl_mav.scenario.model import DEFAULT_ARENA, ArenaName
+
+if TYPE_CHECKING:
+    from airl_mav.arena.mesh_boxes import MeshBoxes
+
+EXTRAS = ("mesh",)
+
+
+class AssetOptions(ProfileModel):
+    """Make an arena profile whose obstacles are a mesh, as boxes that cover it.
+
+    Every camera, plant and planner knows boxes. The cells that the mesh is cut into are as fine as
+    the number of boxes allows; what the boxes cover beyond the mesh is told.
+
+    Examples:
+        airl asset pillar.stl --out pillars.toml
+        airl asset shelf.glb --most 64 --arena dense-obstacles --out shelves.toml
+        airl render pillars.toml --seed 3 --out pillars.png
+    """
+
+    mesh: Annotated[Path, POSITIONAL] = Field(
+        description="the mesh: .stl, .obj, .glb, .gltf, .ply or .off"
+    )
+    out: Path = Field(description="arena profile to write (.toml)")
+    name: str | None = Field(
+        default=None, description="name of the asset; by default that of the file"
+    )
+    arena: ArenaName = Field(
+        default=DEFAULT_ARENA, description="arena profile whose obstacles become the mesh"
+    )
+    most: int = quantity("greatest number of boxes", "1", ge=1, le=MOST_PARTS, default=64)
+    scale: float = quantity("metres per unit of the file", "m", gt=0, le=1e6, default=1.0)
+    up: Literal["auto", "y", "z"] = Field(
+        default="auto", description="axis of the file that points up; auto: y for .glb, else z"
+    )
+
+
+OPTIONS = AssetOptions
+
+
+def run(options: AssetOptions, console: Console | None = None) -> int:
+    """Write the profile. Returns exit status 0.
+
+    Raises:
+        UsageError: The mesh cannot be used, or the profile not be written there.
+    """
+    # Imported here: trimesh is an extra.
+    from airl_mav.arena.mesh_boxes import boxes_of_mesh
+
+    console = console or new_console()
+    if options.out.suffix.lower() != ".toml":
+        raise FieldError("out", f"{options.out}", "a file name that ends in .toml")
+    name = _name(options)
+    made = boxes_of_mesh(options.mesh, most=options.most, scale=options.scale, up=options.up)
+    text = _profile(options, name, made)
+    with tempfile.TemporaryDirectory() as folder:
+        tried = Path(folder) / options.out.name
+        tried.write_text(text, encoding="utf-8")
+        load_profile("arenas", str(tried), ArenaSpec)  # before anything is written for good
+    try:
+        replace_file(options.out, text.encode())
+    except OSError as error:
+        raise FieldError(
+            "out", f"{options.out}", problem=f"cannot write: {error.strerror}"
+        ) from None
+    console.print(
+        f"{name}: {_told(made)}",
+        f"written: {options.out}",
+        sep="\n",
+        soft_wrap=True,
+        highlight=False,
+    )
+    return 0
+
+
+def _name(options: AssetOptions) -> str:
+    name = options.name or options.mesh.stem.lower().replace("_", "-").replace(" ", "-")
+    if name in SHAPES or ASSET_NAME.fullmatch(name) is None:
+        raise FieldError(
+            "name", name, "small letters, with dashes between words, and no name of a shape"
+        )
+    return name
+
+
+def _told(made: MeshBoxes) -> str:
+    """Return what became of a mesh, for people."""
+    forward, right, height = made.size_m
+    inside = "closed, filled" if made.closed else "not closed: its surface alone"
+    return (
+        f"{len(made.asset.parts)} boxes for {forward:.3g} x {right:.3g} x {height:.3g} m (forward,"
+        f" right, up; {inside}), which cover all of it and reach at most {made.beyond_m:.3g} m"
+        f" beyond (cells of {made.cell_m:.3g} m)"
+    )
+
+
+def _profile(options: AssetOptions, name: str, made: MeshBoxes) -> str:
+    arena = options.arena
+    base = str(Path(arena).absolute()) if arena.endswith(".toml") else arena
+    parts = [
+        part.model_dump(exclude_defaults=True) | {"shape": part.shape} for part in made.asset.parts
+    ]
+    data = {
+        "base": base,
+        "description": f"{name}, from {options.mesh.name}",
+        "static": {"shapes": [name]},
+        "assets": {name: {"parts": parts}},
+    }
+    return f"# airl asset {options.mesh.name}: {_told(made)}\n" + tomli_w.dumps(data)
