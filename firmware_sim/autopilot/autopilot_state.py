@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from airl_mav.core.frames import Geodetic
 from firmware_sim.autopilot.events.definition import Definition, Event
 from firmware_sim.autopilot.manual_control import Sticks
-from firmware_sim.interfaces import BatterySample, GpsFix
+from firmware_sim.interfaces import BatterySample, GpsFix, Odometry
 
 Vector = NDArray[np.float64]
 
@@ -298,6 +298,10 @@ class AutopilotState(NamedTuple):
     """A pilot's; None = none are heard."""
     esc_outputs: tuple[float, float, float, float] | None = None
     """What the speed controllers report that their motors do; None: what they are told."""
+    odometry: Odometry | None = None
+    """The newest pose that something else has estimated; None before any."""
+    odometry_us: int = 0
+    """When it was told [µs]."""
 
     @property
     def has_pilot(self) -> bool:

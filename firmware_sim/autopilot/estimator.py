@@ -99,6 +99,10 @@ class Estimator:
         """What something else has estimated of the vehicle's pose."""
         self.flying = False
         """Whether the vehicle is in the air; set by whoever knows."""
+        self.odometry: Odometry | None = None
+        """The newest pose that something else has estimated; None before any."""
+        self.odometry_us = 0
+        """When it was told [µs]."""
         self._field: Vector | None = None
         """The newest that the compass has measured (3,) FRD [gauss]; before alignment the mean."""
 
@@ -126,6 +130,7 @@ class Estimator:
 
     def see(self, odometry: Odometry) -> None:
         """Take what something else has estimated, now."""
+        self.odometry, self.odometry_us = odometry, self._time_us
         if self._aligned_us is not None:
             gps = self._uses_gps and self.fuses_gps(self._time_us)
             self.vision.take(odometry, self._time_us, gps=gps, flying=self.flying)

@@ -86,4 +86,6 @@ def snapshot(
         health=parts.supervisor.health(sample.time_us),
         sticks=context.sticks,
         esc_outputs=sample.esc_outputs,
+        odometry=parts.estimator.odometry,
+        odometry_us=parts.estimator.odometry_us,
     )

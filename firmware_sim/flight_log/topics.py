@@ -139,6 +139,20 @@ TOPICS: tuple[Logged, ...] = (
     ),
     Logged(
         Topic(
+            "vehicle_visual_odometry",
+            (
+                *("uint64_t timestamp_sample", "uint8_t pose_frame", "float[3] position"),
+                *("float[4] q", "uint8_t velocity_frame", "float[3] velocity"),
+                *("float[3] angular_velocity", "float[3] position_variance"),
+                *("float[3] orientation_variance", "float[3] velocity_variance"),
+                *("uint8_t reset_counter", "int8_t quality"),
+            ),
+        ),
+        40 * _EVERY_MS,
+        values.visual_odometry,
+    ),
+    Logged(
+        Topic(
             "vehicle_global_position",
             (
                 *("uint64_t timestamp_sample", "double lat", "double lon"),

@@ -6,11 +6,11 @@ import math
 from typing import NamedTuple
 
 from airl_mav.core.constants import TICK_US
-from airl_mav.core.frames import local_to_geodetic, quat_yaw
+from airl_mav.core.frames import Vector, local_to_geodetic, quat_yaw
 from airl_mav.vehicle import atmosphere
 from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Landed, Mode
 from firmware_sim.flight_log.ulog import Values
-from firmware_sim.interfaces import SensorSample, Truth
+from firmware_sim.interfaces import PoseFrame, SensorSample, Truth, VelocityFrame
 
 NAVIGATION_STATES: dict[Mode, int] = {
     Mode.MANUAL: 0,
@@ -37,6 +37,12 @@ DISARMED, ARMED = 1, 2
 
 ROTARY_WING = 1
 """VehicleStatus.vehicle_type."""
+
+POSE_FRAMES: dict[PoseFrame, int] = {"ned": 1, "frd": 2}
+"""VehicleOdometry.pose_frame."""
+
+VELOCITY_FRAMES: dict[VelocityFrame, int] = {"ned": 1, "frd": 2, "body": 3}
+"""VehicleOdometry.velocity_frame."""
 
 MOTORS = 12
 """ActuatorMotors.NUM_CONTROLS: those that do not exist are NaN."""
@@ -171,6 +177,32 @@ def gps(moment: Moment) -> Values | None:
         fix.fix_type,
         True,
         fix.satellites,
+    )
+
+
+def visual_odometry(moment: Moment) -> Values | None:
+    """Return the newest pose that something other than the flight controller has estimated."""
+    state = moment.state
+    told = state.odometry
+    if told is None:
+        return None
+
+    def numbers(values: Vector | None, count: int) -> list[float]:
+        return [math.nan] * count if values is None else list(map(float, values))
+
+    return (
+        state.odometry_us,
+        POSE_FRAMES[told.pose_frame],
+        *numbers(told.position, 3),
+        *numbers(told.quaternion, 4),
+        VELOCITY_FRAMES[told.velocity_frame],
+        *numbers(told.velocity, 3),
+        *_NO_VECTOR,
+        *numbers(told.position_variance, 3),
+        *numbers(told.orientation_variance, 3),
+        *numbers(told.velocity_variance, 3),
+        told.reset_counter,
+        told.quality,
     )
 
 

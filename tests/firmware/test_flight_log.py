@@ -115,6 +115,35 @@ def test_parameters_that_change_after_the_log_was_closed_go_nowhere(tmp_path: Pa
     assert ULog(str(tmp_path / "flight-001.ulg")).changed_parameters == []
 
 
+def test_vision_is_logged_as_it_was_told(tmp_path: Path) -> None:
+    """By the topic that Flight Review and PX4's own tools look for."""
+    firmware = Firmware(
+        BuiltinFlightStack(MavlinkServer([onboard_link(MemoryEndpoint())], boot_unix_us=0)),
+        None,
+        Unpaced(),
+    )
+    with closing(firmware):
+        firmware.load(EpisodeSetup(load_vehicle("quad-vio"), None, 1), tmp_path / "f.tlog", 0)
+        for _ in range(1_000):
+            firmware.step()
+        firmware.save(tmp_path / "f.npz")
+    log = ULog(str(tmp_path / "f.ulg"))
+    seen, truth = topic(log, "vehicle_visual_odometry"), topic(log, "vehicle_attitude_groundtruth")
+    assert len(seen["timestamp"]) > 80
+    assert np.all(np.diff(seen["timestamp_sample"]) > 0)
+    # In the frame of the start, whose heading nobody knows: it stands there, and is upright.
+    assert set(seen["pose_frame"]) == {2}
+    for axis in range(3):
+        assert seen[f"position[{axis}]"] == pytest.approx(0.0, abs=0.2)
+        assert np.all(seen[f"position_variance[{axis}]"] > 0.0)
+        assert np.isnan(seen[f"angular_velocity[{axis}]"]).all()
+    level = np.hypot(seen["q[1]"], seen["q[2]"])
+    assert np.median(level) == pytest.approx(
+        float(np.median(np.hypot(truth["q[1]"], truth["q[2]"]))), abs=0.03
+    )
+    assert set(seen["quality"]) == {0}  # the simulated camera tells none
+
+
 def test_intervals_are_met_by_the_grid() -> None:
     assert [logged.topic.name for logged in TOPICS if logged.interval_us % GRID_US] == []
 
