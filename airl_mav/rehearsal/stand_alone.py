@@ -64,6 +64,8 @@ def fly_vehicle(
         host, instance = asked.companion_host, asked.real.instance
         return bind_device_links(asked.bind, host, instance, insecure=insecure, say=ports.append)
 
+    # Before any port is bound: what is wrong with an arena is told, whatever else is running.
+    episode, goal = episode_of(asked, vehicle, computer_w)
     firmware = build_firmware(
         asked,
         vehicle,
@@ -81,7 +83,6 @@ def fly_vehicle(
     with closing(firmware):
         firmware.on_message = listener.text
         firmware.on_log_lost = listener.say
-        episode, goal = episode_of(asked, vehicle, computer_w)
         warm_up(vehicle, asked.plant)
         if (hint := how_to_start(asked, vehicle)) is not None:
             listener.waiting(hint)

@@ -172,7 +172,11 @@ def test_sitl_options(refuse: Run, options: list[str], words: list[str]) -> None
         (["--bind", "0.0.0.0"], ["0.0.0.0:14580", "--insecure"]),  # noqa: S104
         (["--bind", "everywhere"], ["'everywhere'", "IPv4"]),
         (["--companion-host", "192.168.1.20"], ["192.168.1.20:14540", "--insecure"]),
-        (["--gcs-host", "192.168.1.20"], ["192.168.1.20:14550", "--insecure"]),
+        # The other link is bound before, to a free port: another simulator may be running.
+        (
+            ["--gcs-host", "192.168.1.20", "--api-local-port", "0"],
+            ["192.168.1.20:14550", "--insecure"],
+        ),
     ],
     ids=" ".join,
 )
