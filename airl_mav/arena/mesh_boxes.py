@@ -119,6 +119,7 @@ def _finest(
     failed, share = 0, COARSEST
     while share >= FINEST and failed < PATIENCE:
         cell_m = share * side_m
+        # The coarser cut is cut on; trimesh has no types for the function.
         vertices, faces = trimesh.remesh.subdivide_to_size(  # type: ignore[no-untyped-call]
             vertices, faces, EDGE_SHARE * cell_m, max_iter=MOST_CUTS
         )

@@ -26,7 +26,7 @@ from airl_mav.refitting.quantity import FittedQuantity
 from airl_mav.refitting.response import ResponseFit, fit_response
 from airl_mav.refitting.thrust import Known, Thrust, fit_thrust
 from airl_mav.report.recorded_flight import stamps_of
-from airl_mav.vehicle_log.ulog import VehicleLog, read_vehicle_log
+from airl_mav.vehicle_log.ulog import read_vehicle_log
 
 SCHEMA = 1
 """Version of `refit.json`."""
@@ -123,13 +123,15 @@ def refit(
     """
     if out is not None and out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise FieldError("out", f"{out}", "a new or empty folder: it holds something else")
-    alone = path.suffix.lower() == LOG_SUFFIX
-    if alone and ulg is not None:
-        raise FieldError("ulg", f"{ulg}", f"nothing beside {path}, which is a log already")
-    box = None if alone else read_black_box(path)
-    ulg = path if alone else ulg
-    log = None if ulg is None else read_vehicle_log(ulg)
-    flown = _flown(box, log)
+    box: BlackBox | None = None
+    if path.suffix.lower() == LOG_SUFFIX:
+        if ulg is not None:
+            raise FieldError("ulg", f"{ulg}", f"nothing beside {path}, which is a log already")
+        ulg = path
+        flown = flown_by_log(read_vehicle_log(path))
+    else:
+        box = read_black_box(path)
+        flown = flown_of(box, None if ulg is None else read_vehicle_log(ulg))
     config = {} if box is None else box.run.get("config", {})
     base = vehicle or str(config.get("vehicle", "quad"))
     profile = load_vehicle(base)
@@ -141,7 +143,7 @@ def refit(
     thrust = fit_thrust(flown, flying, air, known, streams[1])
     response = fit_response(flown, profile.response, streams[2])
     overrides = overrides_of(
-        profile, flying, response, thrust, air, {} if log is None else log.parameters
+        profile, flying, response, thrust, air, {} if flown.log is None else flown.log.parameters
     )
     found = Refit(
         black_box=None if box is None else path,
@@ -161,13 +163,6 @@ def refit(
     if out is not None:
         _write(found, box, board, out)
     return found
-
-
-def _flown(box: BlackBox | None, log: VehicleLog | None) -> Flown:
-    if box is not None:
-        return flown_of(box, log)
-    assert log is not None  # noqa: S101 (one of the two is there)
-    return flown_by_log(log)
 
 
 def _board(name: str) -> tuple[ComputerProfile, tuple[str, ...]]:
