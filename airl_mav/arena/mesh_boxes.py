@@ -2,8 +2,8 @@
 
 Cameras, contacts, planners and renderers know boxes, cylinders and spheres, so a mesh becomes
 boxes: it is cut into cubic cells, those that its surface passes through are taken, a closed one is
-filled, and neighbouring cells are joined. What is covered is no less than the mesh, and at most the
-diagonal of one cell more.
+filled, and neighbouring cells are joined. What is covered is no less than the mesh, and at most
+`MeshBoxes.beyond_m` more.
 """
 
 from __future__ import annotations

@@ -18,6 +18,7 @@ from scipy.signal import lfilter
 
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.frames import quats_to_euler
+from airl_mav.flight.statistics import QUANTILE
 from airl_mav.profiles.vehicle import Response
 from airl_mav.refitting.flown import Flown, seconds
 from airl_mav.refitting.quantity import Array, FittedQuantity, block_intervals, unobserved
@@ -38,9 +39,6 @@ DIFFERENCES = (0.02, 0.02, 0.02)
 """Steps of the numerical derivatives, as shares: the model is piecewise linear in the dead time."""
 
 LEAST_DECISIONS = 8
-NORMAL_95 = 1.96
-"""Half width of a 95 % interval, in standard deviations."""
-
 WIDEST_S, WIDEST_SHARE = 0.05, 0.4
 """A dead time that is known no better, or a time constant, is not observable."""
 
@@ -233,7 +231,7 @@ def _link_share(flown: Flown) -> tuple[float, float, str]:
         # A change is first seen in the sample after it: half their distance later, on the mean.
         step_s = float(np.median(np.diff(flown.sent_us))) / US_PER_S
         changed = int(np.count_nonzero(np.any(np.diff(flown.setpoints, axis=0), axis=1)))
-        unsure_s = NORMAL_95 * step_s / math.sqrt(12.0 * max(changed, 1))
+        unsure_s = QUANTILE * step_s / math.sqrt(12.0 * max(changed, 1))
         return (
             -0.5 * step_s,
             unsure_s,

@@ -51,6 +51,12 @@ def topic(log: ULog, name: str) -> dict[str, Any]:
     return data
 
 
+def unpaced_firmware() -> Firmware:
+    """Return the built-in flight controller, whose link nobody listens to."""
+    links = [onboard_link(MemoryEndpoint())]
+    return Firmware(BuiltinFlightStack(MavlinkServer(links, boot_unix_us=0)), None, Unpaced())
+
+
 def test_what_is_written_is_read(tmp_path: Path) -> None:
     path = tmp_path / "log.ulg"
     log = write(path)
@@ -96,12 +102,7 @@ def test_every_mode_has_its_number() -> None:
 
 
 def test_parameters_that_change_after_the_log_was_closed_go_nowhere(tmp_path: Path) -> None:
-    firmware = Firmware(
-        BuiltinFlightStack(MavlinkServer([onboard_link(MemoryEndpoint())], boot_unix_us=0)),
-        None,
-        Unpaced(),
-    )
-    with closing(firmware):
+    with closing(unpaced_firmware()) as firmware:
         setup = EpisodeSetup(load_vehicle("quad"), None, 1)
         firmware.load(setup, tmp_path / "flight-001.tlog", 0)
         firmware.step()
@@ -117,12 +118,7 @@ def test_parameters_that_change_after_the_log_was_closed_go_nowhere(tmp_path: Pa
 
 def test_vision_is_logged_as_it_was_told(tmp_path: Path) -> None:
     """By the topic that Flight Review and PX4's own tools look for."""
-    firmware = Firmware(
-        BuiltinFlightStack(MavlinkServer([onboard_link(MemoryEndpoint())], boot_unix_us=0)),
-        None,
-        Unpaced(),
-    )
-    with closing(firmware):
+    with closing(unpaced_firmware()) as firmware:
         firmware.load(EpisodeSetup(load_vehicle("quad-vio"), None, 1), tmp_path / "f.tlog", 0)
         for _ in range(1_000):
             firmware.step()
