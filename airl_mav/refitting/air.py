@@ -1,18 +1,33 @@
-"""Drag and wind, from how the vehicle leans, and what it gains of it.
+"""Drag and wind, from what the air does across the body's axis.
 
 Rotors push along the body's axis, so what accelerates a vehicle across it is the air: with the
-drag D per mass, k = D / m, and the wind w, a velocity v is braked by k (v - w):
+drag D per mass, k = D / m, and the wind w, a velocity v is braked by k (v - w).
+
+The vehicle's log holds what the accelerometer felt, in which gravity is not: along the body's x
+and y axes
+
+    a = -k R' (v - w) + b + c (w_y, -w_x)
+
+R' turns from NED to the body's axes. The attitude hardly matters: five milliradians of it change a
+by as much as they turn (v - w). b is the accelerometer's bias, with a normal prior, and is told
+from the wind by flying with several headings. w_x and w_y are the rates of roll and pitch: rotors
+above the centre of mass feel the air that these blow past them, and where a sample is the mean of
+the time since the one before, it is turned by what the vehicle has turned meanwhile. (PX4's own
+estimator tells drag from wind so: EKF2_DRAG_CTRL.)
+
+Telemetry has no accelerometer. There the same is found in how the vehicle leans, and what it gains
+of that:
 
     v' = g + f z - k (v - w)
 
 z is the body's up axis, f the thrust per mass, which the vertical part of the equation gives. The
-level part is linear in k and k w. It is averaged over windows of half a second.
+level part is averaged over windows of half a second. Here an error of the attitude, as of an
+accelerometer that is biased, looks like wind while the heading stays. It is estimated along with
+the rest, as a bias along the body's axes with a normal prior: of the profile's accelerometer until
+the vehicle has manoeuvred, and smaller after, when an estimator has told tilt and bias apart. So
+the interval of the wind is wide where the flight is short, or the drag small.
 
-An error of the attitude, as of an accelerometer that is biased, looks like wind while the heading
-stays. It is estimated along with the rest, as a bias along the body's axes with a normal prior: of
-the profile's accelerometer until the vehicle has manoeuvred, and smaller after, when an estimator
-has told tilt and bias apart. So the interval of the wind is wide where the flight is short, or the
-drag small.
+Both are linear in k and k w.
 """
 
 from __future__ import annotations
@@ -28,6 +43,7 @@ from airl_mav.latency.autocorrelation import integrated_time
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.refitting.flown import Flown
 from airl_mav.refitting.quantity import Array, FittedQuantity, unobserved
+from airl_mav.vehicle_log.ulog import VehicleLog
 
 WINDOW = 13
 """Samples of a window: half a second of telemetry."""
@@ -36,7 +52,20 @@ SETTLE_US = 2 * US_PER_S
 """After so long in navigation an estimator has told tilt and bias apart [µs]."""
 
 SETTLED_SHARE = 0.4
-"""What is left of an accelerometer's bias in the attitude then."""
+"""What is left of an accelerometer's bias in the attitude then, and along the axis of thrust."""
+
+LEARNT_SHARE = 0.6
+"""What is left of it in what the estimator has corrected until the flight's end. Chosen on the
+first twenty flights of benchmarks/bench_refit.py and twelve of PX4 1.16."""
+
+BY_RATE_M_S = 0.1
+"""How much of a rate the accelerometer may feel as acceleration [m/s² for 1 rad/s]: a thrust of 1 g
+that is turned by a sample's time of 4 ms is 0.04, drag of 0.2 1/s on rotors 10 cm up 0.02."""
+
+OFF_M_S, OFF_S = 0.03, 4.0
+"""An estimator's velocity is off by so much along an axis [m/s], and for so long by about the same
+[s]: what PX4 1.16 estimated in twelve simulated flights whose truth is known. The accelerometer's
+equations take it for wind."""
 
 SKEW_S = 0.01
 """By how much attitude and velocity in telemetry may be of different moments [s]."""
@@ -46,10 +75,12 @@ UNSEEN = 2.0
 times that which the rows show. Chosen on the first twenty flights of benchmarks/bench_refit.py."""
 
 LEAST_ROWS = 4 * WINDOW
+LEAST_FELT = 40
+"""Samples of the accelerometer: two seconds of what PX4 logs by default."""
 DRAWS = 4000
 """Of the posterior distribution: wind is a ratio."""
 
-WIDEST_DRAG, WIDEST_WIND_M_S = 0.5, 1.0
+WIDEST_DRAG, WIDEST_WIND_M_S = 0.2, 1.0
 """Half widths of intervals, of the drag as a share, from which on nothing is observable."""
 
 ITERATIONS = 4
@@ -98,7 +129,7 @@ class _Rows:
     """Equations of accelerations: what is left = matrix @ parameters."""
 
     matrix: Array
-    """(n, 2, 3 + biases)."""
+    """(n, 2, 3 + others)."""
     left: Array
     """(n, 2) [m/s²]."""
     velocity: Array
@@ -106,7 +137,10 @@ class _Rows:
     axes: Array
     """(n, 2, 3) how a force NED enters the two equations."""
     prior: tuple[float, ...]
-    """Standard deviations of the biases [m/s²], and of how early the lean is [s]."""
+    """Standard deviations of the others: biases [m/s²]; what is felt of rates [m/s], or how early
+    the lean is [s]."""
+    off: float = 0.0
+    """How much slow errors of the velocity weigh as noise of single samples [m²/s²]."""
 
 
 def fit_air(flown: Flown, vehicle: VehicleProfile, rng: np.random.Generator) -> Air:
@@ -121,8 +155,11 @@ def fit_air(flown: Flown, vehicle: VehicleProfile, rng: np.random.Generator) -> 
     quadratic_1_m = vehicle.drag.quadratic_n_s2_m2 / mass_kg
     known = vehicle.drag.linear_n_s_m / mass_kg
     bias_m_s2 = vehicle.sensors.imu.accel_bias_m_s2
-    source = f"lean and acceleration in {flown.told_by}"
-    rows = _rows(flown, bias_m_s2)
+    source = "accelerometer, velocity and attitude in the vehicle's log"
+    rows = _felt_rows(flown, bias_m_s2)
+    if rows is None:
+        source = f"lean and acceleration in {flown.told_by}"
+        rows = _lean_rows(flown, bias_m_s2)
     if rows is None:
         return _nothing("the flight is too short", known, quadratic_1_m)
     middle, covariance = _posterior(rows, quadratic_1_m)
@@ -177,7 +214,45 @@ def _estimate(
     )
 
 
-def _rows(flown: Flown, bias_m_s2: float) -> _Rows | None:
+def _felt_rows(flown: Flown, bias_m_s2: float) -> _Rows | None:
+    """Return the equations of the accelerometer across the body's axis, where a log has it.
+
+    It is the sensor as it measured, less what the estimator has learnt of its bias in the end: what
+    is corrected in flight changes as it learns.
+    """
+    log = flown.log
+    if log is None:
+        return None
+    start_us, end_us = (flown.logged_us(each) for each in flown.airborne_us)
+    felt = log.raw_specific_force.between(start_us, end_us)
+    if len(felt) < LEAST_FELT or not len(log.raw_rates):
+        return None
+    velocity = log.motion.at(felt.time_us)[:, 3:]
+    axes = _rotation(log.attitude.at(felt.time_us)).transpose(0, 2, 1)[:, :2]
+    braked = -np.einsum("nij,nj->ni", axes, velocity)
+    biases = [np.broadcast_to(each, braked.shape) for each in np.eye(2)]
+    by_rate = log.raw_rates.at(felt.time_us)[:, [1, 0]] * np.array([1.0, -1.0])
+    matrix = np.stack([braked, axes[:, :, 0], axes[:, :, 1], *biases, by_rate], axis=2)
+    learnt = _learnt_bias(log, flown.logged_us(flown.navigation_us) + SETTLE_US, end_us)
+    sigma_m_s2 = bias_m_s2 if learnt is None else LEARNT_SHARE * bias_m_s2
+    across = felt.values[:, :2] - (0.0 if learnt is None else learnt[:2])
+    prior = (sigma_m_s2, sigma_m_s2, BY_RATE_M_S)
+    sample_s = (felt.time_us[-1] - felt.time_us[0]) / US_PER_S / (len(felt) - 1)
+    # Of a first-order Gauss-Markov process.
+    off = OFF_M_S**2 * 2.0 * OFF_S / sample_s
+    return _Rows(matrix, across, velocity, axes, prior, off)
+
+
+def _learnt_bias(log: VehicleLog, start_us: float, end_us: float) -> Array | None:
+    """Return the accelerometer's bias (3,) that the estimator has learnt of a flight [m/s²]."""
+    corrected = log.specific_force.between(start_us, end_us)
+    if len(corrected) < LEAST_FELT:
+        return None
+    measured = log.raw_specific_force.at(corrected.time_us)
+    return np.asarray(np.mean(measured - corrected.values, axis=0))
+
+
+def _lean_rows(flown: Flown, bias_m_s2: float) -> _Rows | None:
     """Return the equations of telemetry: velocity gained in a window, against lean and drag.
 
     Attitude and velocity of an estimator are not of quite the same moment. In a flight that goes
@@ -233,7 +308,7 @@ def _posterior(rows: _Rows, quadratic_1_m: float) -> tuple[Array, Array]:
         if step:
             error = left - rows.matrix @ middle
             slow = max(1.0, *(integrated_time(each) for each in error.T))
-            noise = UNSEEN * float(np.mean(error**2)) * slow
+            noise = UNSEEN * float(np.mean(error**2)) * slow + middle[_DRAG] ** 2 * rows.off
         precision = np.diag(held**-2.0) + matrix.T @ matrix / noise
         covariance = np.asarray(np.linalg.inv(precision), np.float64)
         middle = np.asarray(covariance @ matrix.T @ left.reshape(-1) / noise, np.float64)

@@ -2,11 +2,13 @@
 
 Along the body's up axis the accelerometer feels thrust / m less the drag's part. Motor commands
 tell the thrust as a share of the greatest, so the ratio of the two over a flight is thrust_max / m:
-never the one or the other alone. Means over the whole flight cancel the rotors' lag and vibration.
+never the one or the other alone. Means over the whole flight cancel the rotors' lag and vibration,
+and leave what is wrong with the accelerometer's bias that the estimator has learnt.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -14,13 +16,16 @@ import numpy as np
 
 from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S
 from airl_mav.profiles.vehicle import CORNERS, VehicleProfile
-from airl_mav.refitting.air import Air
+from airl_mav.refitting.air import SETTLED_SHARE, Air
 from airl_mav.refitting.flown import Flown
 from airl_mav.refitting.quantity import Array, FittedQuantity, mean_interval, unobserved
 from airl_mav.vehicle_log.ulog import VehicleLog
 
 Known = Literal["thrust", "mass"]
 """Which of the two the profile is right about."""
+
+DEVIATIONS = 1.96
+"""Standard deviations from the mean to the ends of a 95 % interval."""
 
 LEAST_SAMPLES = 20
 WIDEST = 0.15
@@ -121,6 +126,8 @@ def _ratio(
     # The ratio's error by its linearisation: that of the mean of what is left over.
     left = carried - value * shared
     low, high = mean_interval(left, felt.time_us / US_PER_S, rng)
+    bias_m_s2 = DEVIATIONS * SETTLED_SHARE * vehicle.sensors.imu.accel_bias_m_s2
+    low, high = -math.hypot(low, bias_m_s2), math.hypot(high, bias_m_s2)
     low, high = (value + end / float(shared.mean()) for end in (low, high))
     if 0.5 * (high - low) > WIDEST * value:
         return without(f"known to {0.5 * (high - low) / value:.0%}; {WIDEST:.0%} is needed")

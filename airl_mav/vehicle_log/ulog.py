@@ -103,6 +103,8 @@ class VehicleLog:
     """Forward, right, down [m/s²]; without the bias that the estimator knows of."""
     raw_specific_force: Series
     """The same as measured, with its bias."""
+    raw_rates: Series
+    """Angular velocity about forward, right, down [rad/s], as measured, with its bias."""
     setpoint: Series
     """Velocity that is tracked, north, east, down [m/s], and yaw rate [rad/s]."""
     yaw_rate_setpoint: Series
@@ -148,6 +150,7 @@ def read_vehicle_log(path: Path) -> VehicleLog:
         raw_specific_force=_known(
             _series(topics, "sensor_combined", _numbered("accelerometer_m_s2", 3))
         ),
+        raw_rates=_known(_series(topics, "sensor_combined", _numbered("gyro_rad", 3))),
         setpoint=_setpoint(topics),
         yaw_rate_setpoint=_known(
             _series(topics, "vehicle_attitude_setpoint", ("yaw_sp_move_rate",))

@@ -21,7 +21,7 @@ from airl_mav.refitting.quantity import block_intervals, mean_interval
 from airl_mav.refitting.response import TELEMETRY_AGE_S, fit_response
 from airl_mav.refitting.thrust import fit_thrust
 from airl_mav.vehicle_log.alignment import marzullo
-from airl_mav.vehicle_log.ulog import read_vehicle_log
+from airl_mav.vehicle_log.ulog import Series, VehicleLog, empty, read_vehicle_log
 
 QUAD = load_vehicle("quad")
 STILL = np.zeros(0, np.int64)
@@ -78,24 +78,65 @@ def path_of(times: np.ndarray, velocity: np.ndarray, quaternion: np.ndarray) -> 
     return Trajectory(time_us, np.zeros_like(velocity), velocity, quaternion, np.zeros(len(times)))
 
 
-def in_wind(drag_1_s: float, wind: tuple[float, float], seconds: float = 20.0) -> Flown:
-    """A vehicle that leans as it likes, by the equations of motion alone (scipy's integrator)."""
-    nose = Rotation.from_euler("z", 0.7)
+def attitude(t: float, turning_rad_s: float) -> Rotation:
+    lean = [0.15 * np.sin(1.1 * t), 0.2 * np.sin(0.8 * t + 1.0), 0.0]
+    return Rotation.from_euler("z", 0.7 + turning_rad_s * t) * Rotation.from_euler("xyz", lean)
 
-    def attitude(t: float) -> Rotation:
-        lean = [0.15 * np.sin(1.1 * t), 0.2 * np.sin(0.8 * t + 1.0), 0.0]
-        return nose * Rotation.from_euler("xyz", lean)
+
+def in_wind(
+    drag_1_s: float,
+    wind: tuple[float, float],
+    seconds: float = 20.0,
+    turning_rad_s: float = 0.0,
+) -> Flown:
+    """A vehicle that leans as it likes, by the equations of motion alone (scipy's integrator)."""
 
     def slope(t: float, velocity: np.ndarray) -> np.ndarray:
-        up = attitude(t).apply([0.0, 0.0, -1.0])
+        up = attitude(t, turning_rad_s).apply([0.0, 0.0, -1.0])
         against = velocity - np.array([*wind, 0.0])
         thrust = GRAVITY_M_S2 * (1.0 + 0.05 * np.sin(2.0 * t))
         return np.array([0.0, 0.0, GRAVITY_M_S2]) + thrust * up - drag_1_s * against
 
     times = np.arange(0.0, seconds, 0.04)
     solved = solve_ivp(slope, (0.0, seconds), np.zeros(3), t_eval=times, rtol=1e-6, atol=1e-6)
-    turns = np.stack([attitude(t).as_quat(scalar_first=True) for t in times])
+    turns = np.stack([attitude(t, turning_rad_s).as_quat(scalar_first=True) for t in times])
     return flown(path_of(times, solved.y.T, turns), STILL, np.zeros((0, 4)))
+
+
+def logged(
+    drag_1_s: float, wind: tuple[float, float], bias_m_s2: tuple[float, float], tilt_rad: float
+) -> Flown:
+    """The same, turning, of a log whose accelerometer is biased and whose attitude is tilted."""
+    turning_rad_s = 0.4
+    told = in_wind(drag_1_s, wind, turning_rad_s=turning_rad_s)
+    path = told.path
+    seconds = path.time_us / US_PER_S
+    true = Rotation.from_quat(path.quaternion, scalar_first=True)
+    against = path.velocity - np.array([*wind, 0.0])
+    noise = np.random.default_rng(3).normal(0.0, 0.05, path.velocity.shape)
+    felt = true.inv().apply(-drag_1_s * against) + np.array([*bias_m_s2, 0.0]) + noise
+    # Rates by a small turn there and back.
+    rates = np.stack(
+        [
+            (
+                attitude(t - 5e-5, turning_rad_s).inv() * attitude(t + 5e-5, turning_rad_s)
+            ).as_rotvec()
+            for t in seconds
+        ]
+    )
+    tilted = (Rotation.from_euler("x", tilt_rad) * true).as_quat(scalar_first=True)
+    at = path.time_us
+    series = {
+        "attitude": Series(at, tilted),
+        "motion": Series(at, np.hstack([path.position, path.velocity])),
+        "raw_specific_force": Series(at, felt),
+        "raw_rates": Series(at, rates / 1e-4),
+    }
+    widths = {"motors": 4, "specific_force": 3, "setpoint": 4, "yaw_rate_setpoint": 1}
+    widths |= {"more_than_velocity": 6, "nav_state": 1, "battery": 3, "wind": 2}
+    log = VehicleLog(Path("made.ulg"), **series, **{k: empty(n) for k, n in widths.items()})
+    turned = replace(path, quaternion=tilted)
+    return replace(told, path=turned, log=log)
 
 
 @pytest.mark.parametrize(("drag_1_s", "wind"), [(0.2, (3.0, -2.0)), (0.1, (0.0, 4.0))])
@@ -105,6 +146,18 @@ def test_drag_and_wind_are_those_of_the_equations_of_motion(
     air = fit_air(in_wind(drag_1_s, wind), QUAD, np.random.default_rng(0))
     assert air.drag_1_s.value == pytest.approx(drag_1_s, rel=0.02)
     assert air.wind == pytest.approx(wind, abs=0.1)
+
+
+def test_an_accelerometer_tells_the_wind_where_the_attitude_is_wrong() -> None:
+    """Half a degree of tilt is 0.4 m/s of wind to who sees the lean alone, at this drag."""
+    wind = (3.0, -2.0)
+    made = logged(0.2, wind, bias_m_s2=(0.03, -0.02), tilt_rad=np.radians(0.5))
+    air = fit_air(made, QUAD, np.random.default_rng(0))
+    assert "accelerometer" in air.drag_1_s.source
+    assert air.drag_1_s.value == pytest.approx(0.2, rel=0.02)
+    assert air.wind == pytest.approx(wind, abs=0.1)
+    lean = fit_air(replace(made, log=None), QUAD, np.random.default_rng(0))
+    assert lean.wind is not None and lean.wind != pytest.approx(wind, abs=0.2)
 
 
 def test_where_nothing_is_dragged_no_wind_is_claimed() -> None:
