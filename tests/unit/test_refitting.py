@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -126,7 +127,7 @@ def logged(
     )
     tilted = (Rotation.from_euler("x", tilt_rad) * true).as_quat(scalar_first=True)
     at = path.time_us
-    series = {
+    held: dict[str, Any] = {
         "attitude": Series(at, tilted),
         "motion": Series(at, np.hstack([path.position, path.velocity])),
         "raw_specific_force": Series(at, felt),
@@ -134,7 +135,8 @@ def logged(
     }
     widths = {"motors": 4, "specific_force": 3, "setpoint": 4, "yaw_rate_setpoint": 1}
     widths |= {"more_than_velocity": 6, "nav_state": 1, "battery": 3, "wind": 2}
-    log = VehicleLog(Path("made.ulg"), **series, **{k: empty(n) for k, n in widths.items()})
+    held |= {name: empty(width) for name, width in widths.items()}
+    log = VehicleLog(Path("made.ulg"), **held)
     turned = replace(path, quaternion=tilted)
     return replace(told, path=turned, log=log)
 
