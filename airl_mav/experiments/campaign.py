@@ -15,8 +15,7 @@ from pathlib import Path
 from airl_mav.core.compiling import COMPILING
 from airl_mav.core.progress import Progress
 from airl_mav.experiments.executors import Executor, Stop, WorkerError, never
-from airl_mav.experiments.fliers import Flier, FlyEpisodes, LockstepFlier
-from airl_mav.experiments.gym_flier import GymFlier
+from airl_mav.experiments.flier import Flier, FlyEpisodes
 from airl_mav.experiments.live import Ended
 from airl_mav.experiments.store import CampaignStore
 from airl_mav.flight.record import EpisodeRecord
@@ -26,9 +25,23 @@ from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder, another_confi
 from airl_mav.rehearsal.tally import Tally
 from airl_mav.scenario.resolved import PlannedEpisode, ResolvedScenario
 
+
+def _gym_flier(scenario: ResolvedScenario) -> Flier:
+    from airl_mav.experiments.gym_flier import GymFlier
+
+    return GymFlier(scenario)
+
+
+def _lockstep_flier(scenario: ResolvedScenario) -> Flier:
+    # With flight controller and MAVSDK, which level gym would wait for in vain.
+    from airl_mav.experiments.lockstep_flier import LockstepFlier
+
+    return LockstepFlier(scenario)
+
+
 FLIERS: dict[str, Callable[[ResolvedScenario], Flier]] = {
-    "gym": GymFlier,
-    "lockstep": LockstepFlier,
+    "gym": _gym_flier,
+    "lockstep": _lockstep_flier,
 }
 """Levels whose flights go to workers."""
 

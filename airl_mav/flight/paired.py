@@ -220,9 +220,7 @@ def relative_difference(reference: ArrayLike, other: ArrayLike) -> Estimate:
     return Estimate(value, low, high, n)
 
 
-def _percent(
-    first: NDArray[np.float64], second: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _percent(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
     mean = first.mean(axis=-1)
     difference: NDArray[np.float64] = 100.0 * (second.mean(axis=-1) - mean) / mean
     return difference
