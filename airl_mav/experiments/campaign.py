@@ -17,6 +17,7 @@ from airl_mav.core.progress import Progress
 from airl_mav.experiments.executors import Executor, Stop, WorkerError, never
 from airl_mav.experiments.flier import Flier, FlyEpisodes
 from airl_mav.experiments.live import Ended
+from airl_mav.experiments.lockstep_flier import LockstepFlier
 from airl_mav.experiments.store import CampaignStore
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.rehearsal.episode_saver import EpisodeSaver
@@ -27,21 +28,15 @@ from airl_mav.scenario.resolved import PlannedEpisode, ResolvedScenario
 
 
 def _gym_flier(scenario: ResolvedScenario) -> Flier:
+    # Here: with the batch twin, which level lockstep would wait for in vain.
     from airl_mav.experiments.gym_flier import GymFlier
 
     return GymFlier(scenario)
 
 
-def _lockstep_flier(scenario: ResolvedScenario) -> Flier:
-    # With flight controller and MAVSDK, which level gym would wait for in vain.
-    from airl_mav.experiments.lockstep_flier import LockstepFlier
-
-    return LockstepFlier(scenario)
-
-
 FLIERS: dict[str, Callable[[ResolvedScenario], Flier]] = {
     "gym": _gym_flier,
-    "lockstep": _lockstep_flier,
+    "lockstep": LockstepFlier,
 }
 """Levels whose flights go to workers."""
 

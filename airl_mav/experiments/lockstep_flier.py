@@ -7,10 +7,8 @@ from dataclasses import dataclass
 
 from airl_mav.experiments.executors import Stop
 from airl_mav.experiments.flier import FlyEpisodes
-from airl_mav.lockstep.flight import fly
 from airl_mav.rehearsal.run_folder import FIRMWARE_PRINTS, FlownEpisode, RunFolder
 from airl_mav.scenario.resolved import PlannedEpisode, ResolvedScenario
-from firmware_sim.warm_up import warm_up
 
 
 @dataclass(frozen=True)
@@ -25,6 +23,10 @@ class LockstepFlier:
 
     def start(self, folder: RunFolder, stop: Stop) -> FlyEpisodes:  # noqa: ARG002 (asked between flights)
         """Load everything; see `Flier`."""
+        # Here: flight controller and MAVSDK are for those who fly, not for those who have it flown.
+        from airl_mav.lockstep.flight import fly
+        from firmware_sim.warm_up import warm_up
+
         scenario = self.scenario
         warm_up(scenario.vehicle, scenario.scenario.plant)
         log = folder.path / FIRMWARE_PRINTS  # of flights side by side, mixed
