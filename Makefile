@@ -59,15 +59,18 @@ lint: $(ALL)  ## Format, lint, types, import contracts
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-.PHONY: kernels
-kernels: $(ALL)
-	$(BIN)/python scripts/compile_kernels.py
+# What every worker of the tests would compile for itself: kernels, and modules.
+.PHONY: kernels-plant kernels-twin modules
+kernels-plant kernels-twin: kernels-%: $(ALL)
+	$(BIN)/python scripts/compile_kernels.py $*
+
+modules: $(ALL)
 	$(BIN)/python -m pytest --collect-only --quiet --quiet > $(VENV)/.collected
 
-# mypy is one thread: what every worker of the tests would compile for itself compiles beside it.
+# Two at a time, as mypy and a compiler are one thread each; the longest first.
 .PHONY: test
 test: $(ALL)  ## Everything CI checks
-	@$(MAKE) --no-print-directory --jobs 2 --output-sync lint kernels
+	@$(MAKE) --no-print-directory --jobs 2 --output-sync lint kernels-plant kernels-twin modules
 	$(BIN)/python -m pytest -n $(WORKERS) $(SPREAD) -m "not nightly" --durations 25
 
 .PHONY: nightly

@@ -1,8 +1,10 @@
 """Compile every kernel of plant and batch twin, before many processes need them at once.
 
 numba's cache is shared, but has no lock: processes that start together compile the same code each.
+`compile_kernels.py plant` and `compile_kernels.py twin` share little, and may run side by side.
 """
 
+import sys
 from typing import get_args
 
 import numpy as np
@@ -14,11 +16,25 @@ from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.aircraft import HAS_PYBULLET, PlantName
 from firmware_sim.warm_up import warm_up
 
-for plant in get_args(PlantName):
-    if plant == "kernel" or HAS_PYBULLET:
-        warm_up(load_vehicle("quad"), plant)
-for kind in KINDS:
-    short = {"episode": {"time_limit_s": 1.0}, "camera": {"kind": kind}}
-    spec = EnvironmentSpec.model_validate(short)
-    for _ in fly_episodes(spec, lambda seen: np.zeros(len(seen["goal"]), np.int64), [1]):
-        pass
+
+def compile_plant() -> None:
+    """Compile what flight controller and plant fly with."""
+    for plant in get_args(PlantName):
+        if plant == "kernel" or HAS_PYBULLET:
+            warm_up(load_vehicle("quad"), plant)
+
+
+def compile_twin() -> None:
+    """Compile what the batch twin flies and sees with."""
+    for kind in KINDS:
+        short = {"episode": {"time_limit_s": 1.0}, "camera": {"kind": kind}}
+        spec = EnvironmentSpec.model_validate(short)
+        for _ in fly_episodes(spec, lambda seen: np.zeros(len(seen["goal"]), np.int64), [1]):
+            pass
+
+
+PARTS = {"plant": compile_plant, "twin": compile_twin}
+
+if __name__ == "__main__":
+    for part in sys.argv[1:] or PARTS:
+        PARTS[part]()

@@ -15,9 +15,9 @@ from pathlib import Path
 from airl_mav.core.compiling import COMPILING
 from airl_mav.core.progress import Progress
 from airl_mav.experiments.executors import Executor, Stop, WorkerError, never
-from airl_mav.experiments.fliers import Flier, FlyEpisodes, LockstepFlier
-from airl_mav.experiments.gym_flier import GymFlier
+from airl_mav.experiments.flier import Flier, FlyEpisodes
 from airl_mav.experiments.live import Ended
+from airl_mav.experiments.lockstep_flier import LockstepFlier
 from airl_mav.experiments.store import CampaignStore
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.rehearsal.episode_saver import EpisodeSaver
@@ -26,8 +26,16 @@ from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder, another_confi
 from airl_mav.rehearsal.tally import Tally
 from airl_mav.scenario.resolved import PlannedEpisode, ResolvedScenario
 
+
+def _gym_flier(scenario: ResolvedScenario) -> Flier:
+    # Here: with the batch twin, which level lockstep would wait for in vain.
+    from airl_mav.experiments.gym_flier import GymFlier
+
+    return GymFlier(scenario)
+
+
 FLIERS: dict[str, Callable[[ResolvedScenario], Flier]] = {
-    "gym": GymFlier,
+    "gym": _gym_flier,
     "lockstep": LockstepFlier,
 }
 """Levels whose flights go to workers."""

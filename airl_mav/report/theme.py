@@ -159,7 +159,8 @@ def render_png(figure: Figure) -> bytes:
     if (engine := figure.get_layout_engine()) is not None:
         # Once for both forms: laying out costs more than drawing.
         engine.execute(figure)
-        figure.set_layout_engine("none")
+        # Any engine, one that does nothing too, has every figure drawn once more beforehand.
+        figure.set_layout_engine(None)
     png = io.BytesIO()
     figure.savefig(png, format="png", dpi=PNG_DPI)
     return png.getvalue()

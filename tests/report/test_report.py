@@ -38,6 +38,7 @@ from airl_mav.report.shown_flights import MAX_PICTURED
 from airl_mav.report.table import TableView
 from airl_mav.report.theme import DARK
 from airl_mav.report.timeline import slowest_table, timeline_of
+from tests.support.page_alone import page_alone
 from tests.support.run_demo import OUTCOMES_SEEN, demo_setup, write_demo_run
 
 VOID = {"meta", "img", "br", "link", "input", "hr"}
@@ -270,7 +271,8 @@ def test_every_picture_is_a_whole_png(page: str, demo: tuple[LoadedRun, dict[int
 def test_the_same_run_gives_the_same_page(
     page: str, demo: tuple[LoadedRun, dict[int, Arena]], tmp_path: Path
 ) -> None:
-    assert build_page(*demo, tmp_path / "again").read_text(encoding="utf-8") == page
+    with page_alone():
+        assert build_page(*demo, tmp_path / "again").read_text(encoding="utf-8") == page
 
 
 def test_the_path_on_the_map_is_where_the_vehicle_was(
@@ -397,7 +399,8 @@ def test_user_text_is_escaped(demo: tuple[LoadedRun, dict[int, Arena]], tmp_path
     info = replace(run.info, name=evil, config={evil: evil}, setup=setup)
     episode = replace(run.episodes[0], reason=evil, notes=(evil,))
     spoiled = replace(run, info=info, episodes=(episode,))
-    text = build_page(spoiled, arenas, tmp_path).read_text(encoding="utf-8")
+    with page_alone():
+        text = build_page(spoiled, arenas, tmp_path).read_text(encoding="utf-8")
     parsed = Page(text)
     assert "alert(1)</script>" not in text
     assert text.count("<script") == 3 + plotly_script().count("<script")
@@ -441,9 +444,9 @@ def test_pictures_go_to_the_flights_that_failed(
     bad = next(e for e in run.episodes if e.outcome is Outcome.TIMEOUT)
     n = MAX_PICTURED + 4
     many = [replace(good if i < n - 2 else bad, index=i) for i in range(n)]
-    text = build_page(
-        replace(run, episodes=tuple(many), trajectories={}, latency={}), {}, tmp_path
-    ).read_text(encoding="utf-8")
+    missed = replace(run, episodes=tuple(many), trajectories={}, latency={})
+    with page_alone():
+        text = build_page(missed, {}, tmp_path).read_text(encoding="utf-8")
     shown = [int(i) for i in re.findall(r"<h3>Flight (\d+)</h3>", text)]
     assert len(shown) == MAX_PICTURED
     assert shown[:2] == [n - 2, n - 1]
@@ -481,7 +484,8 @@ def test_a_run_in_which_nothing_arrived(
     lost = replace(run.episodes[0], outcome=Outcome.TIMEOUT, reason="9.00 m from the goal")
     for latency in (run.latency, {}):
         alone = replace(run, episodes=(lost,), latency=latency)
-        path = build_page(alone, arenas, tmp_path, vehicle=load_vehicle("quad"))
+        with page_alone():
+            path = build_page(alone, arenas, tmp_path, vehicle=load_vehicle("quad"))
         text = " ".join(Page(path.read_text(encoding="utf-8")).words)
         assert "Worst flights" in text
         assert "Closest to the goal after" in text

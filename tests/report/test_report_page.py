@@ -20,6 +20,7 @@ from airl_mav.rehearsal.run_folder import load
 from airl_mav.report.run_page import build_page
 from tests.support.browser import CHROMIUM, browser
 from tests.support.browser import Page as Tab
+from tests.support.page_alone import page_alone
 from tests.support.run_demo import write_demo_run
 
 pytestmark = [
@@ -146,7 +147,8 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder, arenas = write_demo_run(
         tmp_path_factory.mktemp("page") / "demo", episodes=3, profile="dynamic-obstacles"
     )
-    return build_page(load(folder.path), arenas, vehicle=load_vehicle("quad"))
+    with page_alone():
+        return build_page(load(folder.path), arenas, vehicle=load_vehicle("quad"))
 
 
 def test_nothing_fails_nothing_is_asked_for_and_the_view_moves(page: Path) -> None:
@@ -328,5 +330,6 @@ def test_a_row_of_the_worst_flights_leads_to_the_flight(tab: Tab) -> None:
 
 def test_a_page_of_twenty_flights_weighs_little(tmp_path: Path) -> None:
     folder, arenas = write_demo_run(tmp_path / "many", episodes=20)
-    page = build_page(load(folder.path), arenas, vehicle=load_vehicle("quad"))
+    with page_alone():
+        page = build_page(load(folder.path), arenas, vehicle=load_vehicle("quad"))
     assert page.stat().st_size <= 4_000_000

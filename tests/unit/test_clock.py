@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import ast
+from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
@@ -145,17 +147,42 @@ def test_sleep_has_lasted_at_least_as_long_as_asked() -> None:
 # --- nobody else
 
 
-def names_in(source: Path) -> tuple[set[str], set[str]]:
-    """Return what a file imports, and the dotted names it uses."""
-    tree = ast.parse(source.read_text(encoding="utf-8"))
-    imported: set[str] = set()
-    for node in ast.walk(tree):
+class Names(NamedTuple):
+    """What there is in a file."""
+
+    imported: set[str]
+    used: set[str]
+    """Dotted names."""
+    unseeded: list[int]
+    """Lines that make a generator without a seed."""
+
+
+def dotted(node: ast.expr) -> str:
+    """Return a dotted name; empty for an attribute of anything else than a name."""
+    if isinstance(node, ast.Name):
+        return node.id
+    if isinstance(node, ast.Attribute) and (before := dotted(node.value)):
+        return f"{before}.{node.attr}"
+    return ""
+
+
+@cache
+def names_in(source: Path) -> Names:
+    """Read a file."""
+    found = Names(set(), set(), [])
+    for node in ast.walk(ast.parse(source.read_text(encoding="utf-8"))):
         if isinstance(node, ast.ImportFrom):
-            imported |= {f"{node.module}.{alias.name}" for alias in node.names}
+            found.imported.update(f"{node.module}.{alias.name}" for alias in node.names)
         elif isinstance(node, ast.Import):
-            imported |= {alias.name for alias in node.names}
-    used = {ast.unparse(n) for n in ast.walk(tree) if isinstance(n, ast.Attribute)}
-    return imported, used
+            found.imported.update(alias.name for alias in node.names)
+        elif isinstance(node, ast.Attribute):
+            found.used.add(dotted(node))
+        elif isinstance(node, ast.Call) and not node.args:
+            called = node.func
+            name = called.attr if isinstance(called, ast.Attribute) else dotted(called)
+            if name in SEEDED:
+                found.unseeded.append(node.lineno)
+    return found
 
 
 def offenders(found: dict[Path, set[str]]) -> dict[str, set[str]]:
@@ -164,7 +191,7 @@ def offenders(found: dict[Path, set[str]]) -> dict[str, set[str]]:
 
 def test_there_are_sources_to_look_at() -> None:
     assert len(SOURCES) > 80
-    imported, used = names_in(CLOCK)
+    imported, used, _ = names_in(CLOCK)
     assert "time" in imported
     assert {"time.monotonic_ns", "time.sleep", "datetime.now"} <= used
 
@@ -172,7 +199,7 @@ def test_there_are_sources_to_look_at() -> None:
 def test_only_the_clock_reads_the_hosts_time() -> None:
     found = {}
     for source in set(SOURCES) - {CLOCK}:
-        imported, used = names_in(source)
+        imported, used, _ = names_in(source)
         found[source] = {n for n in imported if n.split(".")[0] in ("time", "datetime")}
         found[source] -= {"datetime.timedelta"}  # A duration: it reads no clock.
         found[source] |= {n for n in used if n in CLOCK_CALLS}
@@ -186,14 +213,9 @@ LEARNER_STATE = ROOT / "airl_mav" / "training" / "learner_state.py"
 def test_randomness_is_drawn_from_generators_that_are_handed_in() -> None:
     found = {}
     for source in set(SOURCES) - {LEARNER_STATE}:
-        imported, used = names_in(source)
+        imported, used, unseeded = names_in(source)
         found[source] = {n for n in imported if n.split(".")[0] == "random"}
         drawn = {n for n in used if n.startswith(("np.random.", "numpy.random."))}
         found[source] |= {n for n in drawn if n.split(".")[2] not in SEEDED}
-        tree = ast.parse(source.read_text(encoding="utf-8"))
-        for node in ast.walk(tree):
-            if not isinstance(node, ast.Call) or node.args:
-                continue
-            if ast.unparse(node.func).split(".")[-1] in SEEDED:
-                found[source].add(f"no seed in line {node.lineno}")
+        found[source] |= {f"no seed in line {line}" for line in unseeded}
     assert offenders(found) == {}

@@ -83,6 +83,7 @@ def test_moving_obstacles_move(tmp_path: Path) -> None:
     assert (before != after).any()
 
 
+@pytest.mark.nightly  # Pixel by pixel: test_mitsuba.py. Films by it: test_render_film.py.
 def test_mitsuba_draws_the_same_view(tmp_path: Path) -> None:
     pytest.importorskip("mitsuba")
     words = ("dense-obstacles", "--seed", "5", *POSE, *SMALL)

@@ -1,40 +1,14 @@
-"""How the episodes of a scenario are flown in a worker: what each level implements; lockstep."""
+"""How the episodes of a scenario are flown in a worker: lockstep."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 from airl_mav.experiments.executors import Stop
-from airl_mav.lockstep.flight import fly
+from airl_mav.experiments.flier import FlyEpisodes
 from airl_mav.rehearsal.run_folder import FIRMWARE_PRINTS, FlownEpisode, RunFolder
 from airl_mav.scenario.resolved import PlannedEpisode, ResolvedScenario
-from firmware_sim.warm_up import warm_up
-
-FlyEpisodes = Callable[[Sequence[PlannedEpisode]], Iterable[FlownEpisode]]
-
-
-class Flier(Protocol):
-    """How the episodes of a scenario are flown. Goes to workers by pickle."""
-
-    def episodes_per_job(self, episodes: int, workers: int) -> int:
-        """Return how many episodes make a job, for an executor that does not stream results.
-
-        Args:
-            episodes: Number of those that are left.
-            workers: Number of jobs at a time.
-        """
-        ...
-
-    def start(self, folder: RunFolder, stop: Stop) -> FlyEpisodes:
-        """Load everything once; return what flies episodes.
-
-        Args:
-            folder: Where logs go.
-            stop: Whether to leave flights unfinished; to be asked while several fly at a time.
-        """
-        ...
 
 
 @dataclass(frozen=True)
@@ -49,6 +23,10 @@ class LockstepFlier:
 
     def start(self, folder: RunFolder, stop: Stop) -> FlyEpisodes:  # noqa: ARG002 (asked between flights)
         """Load everything; see `Flier`."""
+        # Here: flight controller and MAVSDK are for those who fly, not for those who have it flown.
+        from airl_mav.lockstep.flight import fly
+        from firmware_sim.warm_up import warm_up
+
         scenario = self.scenario
         warm_up(scenario.vehicle, scenario.scenario.plant)
         log = folder.path / FIRMWARE_PRINTS  # of flights side by side, mixed
