@@ -14,7 +14,6 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from airl_mav.flight.bootstrap import bca_interval
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.quality import Quality
 from airl_mav.flight.record import EpisodeRecord
@@ -23,7 +22,6 @@ from airl_mav.flight.statistics import (
     CONFIDENCE,
     MEANS,
     NO_ESTIMATE,
-    QUANTILE,
     RESAMPLES,
     Estimate,
     median_of,
@@ -152,6 +150,7 @@ def tango(gained: int, lost: int, n: int) -> Estimate:
     if n == 0:
         return NO_ESTIMATE
     value = (gained - lost) / n
+    z = float(scipy.stats.norm.ppf(0.5 + 0.5 * CONFIDENCE))
 
     def end(limit: float) -> float:
         # The score falls from +inf at -1 through 0 at the estimate to -inf at +1.
@@ -159,7 +158,7 @@ def tango(gained: int, lost: int, n: int) -> Estimate:
             return limit
         low, high = sorted((value, limit))
         found = scipy.optimize.brentq(
-            lambda difference: _score(difference, gained, lost, n) + limit * QUANTILE,
+            lambda difference: _score(difference, gained, lost, n) + limit * z,
             low,
             high,
             xtol=1e-12,
@@ -210,19 +209,23 @@ def relative_difference(reference: ArrayLike, other: ArrayLike) -> Estimate:
         return Estimate(value, None, None, 1)
     if np.ptp(second / first) <= SAME_RATIO:
         return Estimate(value, value, value, n)
-    low, high = bca_interval(
-        lambda drawn: _percent(first[drawn], second[drawn]),
-        n,
-        confidence=CONFIDENCE,
-        resamples=RESAMPLES,
+    interval = scipy.stats.bootstrap(
+        (first, second),
+        _percent,
+        paired=True,
+        confidence_level=CONFIDENCE,
+        n_resamples=RESAMPLES,
         rng=np.random.default_rng(BOOTSTRAP_SEED),
-    )
-    return Estimate(value, low, high, n)
+        method="BCa",
+    ).confidence_interval
+    return Estimate(value, float(interval.low), float(interval.high), n)
 
 
-def _percent(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
-    mean = first.mean(axis=-1)
-    difference: NDArray[np.float64] = 100.0 * (second.mean(axis=-1) - mean) / mean
+def _percent(
+    first: NDArray[np.float64], second: NDArray[np.float64], axis: int = -1
+) -> NDArray[np.float64]:
+    mean = first.mean(axis=axis)
+    difference: NDArray[np.float64] = 100.0 * (second.mean(axis=axis) - mean) / mean
     return difference
 
 

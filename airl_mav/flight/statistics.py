@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
 
-from airl_mav.flight.bootstrap import bca_interval, binomial_quantile
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.quality import Quality
 from airl_mav.flight.record import EpisodeRecord
@@ -114,14 +114,15 @@ def bootstrap_mean(values: ArrayLike) -> Estimate:
         return Estimate(mean, None, None, 1)
     if np.ptp(data) == 0.0:
         return Estimate(mean, mean, mean, data.size)
-    low, high = bca_interval(
-        lambda drawn: data[drawn].mean(axis=-1),
-        data.size,
-        confidence=CONFIDENCE,
-        resamples=RESAMPLES,
+    interval = scipy.stats.bootstrap(
+        (data,),
+        np.mean,
+        confidence_level=CONFIDENCE,
+        n_resamples=RESAMPLES,
         rng=np.random.default_rng(BOOTSTRAP_SEED),
-    )
-    return Estimate(mean, low, high, data.size)
+        method="BCa",
+    ).confidence_interval
+    return Estimate(mean, float(interval.low), float(interval.high), data.size)
 
 
 def median_of(values: ArrayLike) -> Estimate:
@@ -136,7 +137,7 @@ def median_of(values: ArrayLike) -> Estimate:
     if not n:
         return NO_ESTIMATE
     # The greatest number of values that may be left out on either side.
-    out = binomial_quantile(0.5 * (1.0 - CONFIDENCE), n, 0.5) - 1
+    out = int(scipy.stats.binom.ppf(0.5 * (1.0 - CONFIDENCE), n, 0.5)) - 1
     middle = float(np.median(data))
     if out < 0:
         return Estimate(middle, None, None, n)
