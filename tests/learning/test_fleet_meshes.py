@@ -83,6 +83,7 @@ def test_the_worlds_have_meshes_of_both_kinds(worlds: list[Arena]) -> None:
     assert any(len(world.meshes) < len(world.statics.names) for world in worlds if world.statics)
 
 
+@pytest.mark.timeout(600)  # compiles kernels, on a busy machine for minutes
 def test_depth_is_bit_for_bit_that_of_the_rehearsal(worlds: list[Arena]) -> None:
     n = len(worlds)
     seen, arenas, differ = seen_of(worlds), batch_of(worlds), 0
@@ -104,6 +105,7 @@ def test_depth_is_bit_for_bit_that_of_the_rehearsal(worlds: list[Arena]) -> None
     assert np.array_equal(boxes[-1], out[-1])
 
 
+@pytest.mark.timeout(600)  # compiles kernels, on a busy machine for minutes
 def test_colour_is_bit_for_bit_that_of_the_rehearsal(worlds: list[Arena]) -> None:
     n = len(worlds)
     seen, looks, arenas = seen_of(worlds), Looks(n), batch_of(worlds)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -12,9 +11,8 @@ import numpy as np
 import pytest
 import trimesh
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-from airl_mav.arena.geometry import Arena, Bounds, Obstacles, PlacedMesh, Shape
+from airl_mav.arena.geometry import Arena, Obstacles, PlacedMesh, Shape
 from airl_mav.arena.triangles import Triangles, decoded, encoded, triangles_of
 from airl_mav.camera.bvh import LEAF, build_bvh
 from airl_mav.camera.intrinsics import Intrinsics
@@ -24,46 +22,10 @@ from airl_mav.camera.render import render
 from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import quat_from_euler, quat_to_matrix
 from airl_mav.profiles.appearance import Appearance
-from airl_mav.profiles.mesh_file import MeshFile
 from airl_mav.profiles.projection import PROJECTIONS, Projection
+from tests.support.meshes import ROOM, kept, ring, scene_of, triangles
 
 Floats = NDArray[np.float64]
-
-ROOM = Bounds(-12.0, 12.0, -12.0, 12.0, 5.0)
-
-
-def triangles(mesh: trimesh.Trimesh) -> Triangles:
-    """Return a mesh, z up, as triangles that stand on the floor."""
-    forward, left, up = np.asarray(mesh.vertices, np.float64).T
-    places = np.stack([forward, -left, -(up - up.min())], axis=1)
-    return Triangles(places.astype(np.float32), np.asarray(mesh.faces, np.int32))
-
-
-def kept(held: Triangles, path: Path) -> MeshFile:
-    data = encoded(held)
-    path.write_bytes(data)
-    return MeshFile(file=str(path), sha256=hashlib.sha256(data).hexdigest())
-
-
-def ring() -> trimesh.Trimesh:
-    """Return a ring that stands, of 768 triangles: its hole is seen through, it shades itself."""
-    made = trimesh.creation.torus(0.8, 0.3, major_sections=32, minor_sections=12)
-    turn = np.eye(4)
-    turn[:3, :3] = Rotation.from_rotvec([1.4, 0.3, 0.0]).as_matrix()
-    made.apply_transform(turn)
-    return made
-
-
-def scene_of(file: MeshFile, placed: list[tuple[float, float, float, float]]) -> Arena:
-    """Return a room with meshes: north, east, yaw, scale of each. Their boxes are in the way."""
-    n = len(placed)
-    center = np.array([(north, east, -0.5) for north, east, _, _ in placed]).reshape(n, 3)
-    boxes = Obstacles(np.zeros(n, np.int8), center, np.full((n, 3), 0.5), np.zeros(n))
-    meshes = tuple(
-        PlacedMesh(file, (north, east), yaw, scale, i, 1)
-        for i, (north, east, yaw, scale) in enumerate(placed)
-    )
-    return Arena("test", 0, ROOM, (90, 90, 90), boxes, (), np.zeros(2), meshes=meshes)
 
 
 def without_meshes(arena: Arena) -> Arena:
@@ -127,6 +89,7 @@ def pose_in(rng: np.random.Generator, arena: Arena) -> tuple[Floats, Floats]:
 # --- depth
 
 
+@pytest.mark.timeout(600)  # compiles kernels, on a busy machine for minutes
 @pytest.mark.parametrize("projection", PROJECTIONS)
 def test_depth_is_that_of_rays_in_float64(projection: Projection, tmp_path: Path) -> None:
     file = kept(triangles(ring()), tmp_path / "ring.npz")
@@ -179,6 +142,7 @@ def test_no_ray_passes_between_triangles(tmp_path: Path) -> None:
             np.testing.assert_allclose(seen, np.minimum(depth, floor.reshape(seen.shape)), 1e-6)
 
 
+@pytest.mark.timeout(600)  # compiles kernels, on a busy machine for minutes
 def test_a_mesh_of_a_box_is_the_box(tmp_path: Path) -> None:
     half = np.array([0.6, 0.9, 0.75])
     file = kept(triangles(trimesh.creation.box(2.0 * half)), tmp_path / "box.npz")
