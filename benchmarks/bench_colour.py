@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.table import Table
 
 from airl_mav.arena.geometry import Arena
+from airl_mav.camera.bvh import Meshes
 from airl_mav.camera.colour import Work, render_colour
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.picture import ColourArrays
@@ -43,6 +44,7 @@ def colour_all(
     center: NDArray[np.float64],
     half: NDArray[np.float64],
     yaw: NDArray[np.float64],
+    meshes: Meshes | None,
     texture: NDArray[np.int8],
     per_m: NDArray[np.float32],
     offset: NDArray[np.float32],
@@ -54,7 +56,7 @@ def colour_all(
         p, q = position[i], attitude[i]
         render_colour(
             rgb, depth, seen, work, (p[0], p[1], p[2]), (q[0], q[1], q[2], q[3]), focal, cx, cy,
-            False, bounds, shape, center, half, yaw, texture, per_m, offset, albedo, lights,
+            False, bounds, shape, center, half, yaw, meshes, texture, per_m, offset, albedo, lights,
             patterns,
         )  # fmt: skip
 
@@ -66,7 +68,7 @@ def rates(arena: Arena, k: Intrinsics, poses: tuple[np.ndarray, np.ndarray]) -> 
     rgb, patterns = np.empty((*shape, 3), np.uint8), atlas()
     work = Work.of(k.width, k.height, False)
     lens, bounds = (k.focal, k.cx, k.cy), arena.bounds.as_array()
-    bodies = (*poses, *lens, bounds, o.shape, o.center, o.half_size, o.yaw)
+    bodies = (*poses, *lens, bounds, o.shape, o.center, o.half_size, o.yaw, None)
     surfaces = (look.texture, look.per_m, look.offset, look.albedo, look.lights, patterns)
     coloured = (*bodies, *surfaces)
     times: tuple[list[float], list[float]] = ([], [])

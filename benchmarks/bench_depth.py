@@ -19,6 +19,7 @@ from rich.console import Console
 from rich.table import Table
 
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape
+from airl_mav.camera.bvh import Meshes
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.raycast import render_depth
 from airl_mav.camera.render import render
@@ -71,6 +72,7 @@ def render_all(
     center: NDArray[np.float64],
     half: NDArray[np.float64],
     yaw: NDArray[np.float64],
+    meshes: Meshes | None,
 ) -> None:
     for i in range(len(position)):
         p, q = position[i], attitude[i]
@@ -88,6 +90,7 @@ def render_all(
             center,
             half,
             yaw,
+            meshes,
         )
 
 
@@ -107,7 +110,7 @@ def in_compiled_loop(arena: Arena, k: Intrinsics, poses: tuple[np.ndarray, np.nd
 
     def work() -> int:
         render_all(out, *poses, k.focal, k.cx, k.cy, arena.bounds.as_array(),
-                   o.shape, o.center, o.half_size, o.yaw)  # fmt: skip
+                   o.shape, o.center, o.half_size, o.yaw, None)  # fmt: skip
         return POSES
 
     return rate(work)

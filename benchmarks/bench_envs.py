@@ -118,7 +118,7 @@ def measure_ours() -> list[Result]:
                 advance(fleet, arenas, ticks, vehicle, rules, None)
                 if camera:
                     render_images(
-                        fleet, arenas, fleet.verdict == Verdict.FLYING, mount, lens, images
+                        fleet, arenas, fleet.verdict == Verdict.FLYING, mount, lens, images, None
                     )
                 seconds += time.process_time() - start
             # Only what was flown counts: some touch an obstacle before the stretch is over.

@@ -10,9 +10,19 @@ import numpy as np
 from airl_mav.arena.appearance import Statics
 from airl_mav.arena.bodies import NUMBERS, Bodies, bodies_of
 from airl_mav.arena.footprints import Floats, bounding_half
-from airl_mav.arena.geometry import Obstacles, Shape
+from airl_mav.arena.geometry import Obstacles, PlacedMesh, Shape
 from airl_mav.profiles.arena import SHAPES, ArenaSpec
 from airl_mav.profiles.assets import Asset
+from airl_mav.profiles.mesh_file import MeshFile
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """A mesh that cameras see of a thing."""
+
+    file: MeshFile
+    yaw: float
+    scale: float
 
 
 @dataclass(frozen=True)
@@ -24,10 +34,23 @@ class Things:
     offset: Floats  # (m, 2) of a primitive from its thing's place, north, east [m]
     statics: Statics
     bounding_half: Floats  # (n, 2) half extents north, east about the thing's place [m]
+    seen: tuple[_Seen | None, ...]  # (n,) None: cameras see the primitives
 
     def at(self, places: Floats) -> Obstacles:
         """Return the primitives of things that stand at `places` (n, 2) north, east [m]."""
         return self.parts.at(places[self.statics.of] + self.offset)
+
+    def meshes_at(self, places: Floats) -> tuple[PlacedMesh, ...]:
+        """Return the meshes of things that stand at `places` (n, 2) north, east [m]."""
+        ends = np.searchsorted(self.statics.of, np.arange(len(self.seen)), side="right").tolist()
+        begins = [0, *ends[:-1]]
+        return tuple(
+            PlacedMesh(each.file, (north, east), each.yaw, each.scale, begin, end - begin)
+            for each, (north, east), begin, end in zip(
+                self.seen, places.tolist(), begins, ends, strict=True
+            )
+            if each is not None
+        )
 
 
 @dataclass(frozen=True)
@@ -38,6 +61,7 @@ class _Thing:
     parts: Bodies
     offset: Floats  # (k, 2)
     materials: tuple[str | None, ...]
+    seen: _Seen | None = None
 
     @property
     def reach(self) -> Floats:
@@ -89,7 +113,8 @@ def _turned(name: str, asset: Asset, yaw: float, scale: float) -> _Thing:
     half = bounding_half(shape, half_size, headings)
     bodies = Bodies(shape, half_size, headings, bottom + half_size[:, 2], half)
     offset = np.column_stack([cos * ahead - sin * right, sin * ahead + cos * right])
-    return _Thing(name, bodies, offset, tuple(part.material for part in parts))
+    seen = None if asset.mesh is None else _Seen(asset.mesh, yaw, scale)
+    return _Thing(name, bodies, offset, tuple(part.material for part in parts), seen)
 
 
 def _joined(things: list[_Thing]) -> Things:
@@ -110,4 +135,5 @@ def _joined(things: list[_Thing]) -> Things:
             materials=tuple(name for thing in things for name in thing.materials),
         ),
         np.array([thing.reach for thing in things]).reshape(len(things), 2),
+        tuple(thing.seen for thing in things),
     )

@@ -12,7 +12,7 @@ from airl_mav.arena.appearance import Statics
 from airl_mav.arena.assets import Things, draw_things
 from airl_mav.arena.bodies import Bodies, draw_bodies
 from airl_mav.arena.footprints import Boxes, Floats, footprint_areas, join
-from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Tour
+from airl_mav.arena.geometry import Arena, Bounds, Obstacles, PlacedMesh, Tour
 from airl_mav.arena.own import generate_own
 from airl_mav.arena.passage import free_share, passage_exists
 from airl_mav.arena.placement import TRIES, NoRoomError, place_all
@@ -91,7 +91,7 @@ def generate(
     failure = NoRoomError("", -1)
     for _ in range(LAYOUTS):
         try:
-            static, standing, statics = _draw_static(static_rng, request)
+            static, standing, statics, meshes = _draw_static(static_rng, request)
             goal = _draw_reachable_goal(goal_rng, request, static, standing)
             moving, tours = _draw_moving(moving_rng, request, standing)
         except NoRoomError as error:
@@ -107,6 +107,7 @@ def generate(
             goal=goal,
             appearance=spec.appearance,
             statics=statics,
+            meshes=meshes,
         )
     raise UsageError(f"arena {name!r}, seed {seed}: {failure} (best of {LAYOUTS} layouts)")
 
@@ -158,8 +159,8 @@ def _check_fixed_goal(request: _Request, zone: int | None) -> None:
 
 def _draw_static(
     rng: np.random.Generator, request: _Request
-) -> tuple[Obstacles, Boxes, Statics | None]:
-    """Draw and place the static obstacles; return their bounding boxes and parts as well."""
+) -> tuple[Obstacles, Boxes, Statics | None, tuple[PlacedMesh, ...]]:
+    """Draw and place the static obstacles; return their bounding boxes, parts and meshes, too."""
     spec, (n, _) = request.spec, request.counts
     bodies: Bodies | Things
     if spec.has_assets:
@@ -184,7 +185,8 @@ def _draw_static(
             f"{spec.size.east_m:g} m floor",
             error.progress,
         ) from None
-    return bodies.at(places), Boxes(places, bodies.bounding_half), statics
+    meshes = bodies.meshes_at(places) if isinstance(bodies, Things) else ()
+    return bodies.at(places), Boxes(places, bodies.bounding_half), statics, meshes
 
 
 def _draw_reachable_goal(

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from airl_mav.arena.appearance import Drawn, Statics, draw_appearance
 from airl_mav.core.constants import US_PER_S
 from airl_mav.profiles.appearance import DEFAULT, Appearance
+from airl_mav.profiles.mesh_file import MeshFile
 
 
 class Shape(IntEnum):
@@ -61,6 +62,23 @@ class Obstacles:
 
 
 @dataclass(frozen=True)
+class PlacedMesh:
+    """A mesh that cameras see in place of obstacles, which stay what is hit."""
+
+    file: MeshFile
+    """Its triangles: forward, right and down from its place."""
+    place: tuple[float, float]
+    """Of its origin on the floor: north, east [m]."""
+    yaw: float
+    """Heading of its forward axis [rad]."""
+    scale: float
+    first: int
+    """The first of the obstacles that stand for it. It has the number and the material of this."""
+    count: int
+    """Number of these obstacles, one after the other."""
+
+
+@dataclass(frozen=True)
 class Tour:
     """The closed way of one moving obstacle: way-points passed at given times, over and over."""
 
@@ -85,6 +103,8 @@ class Arena:
     """What the look is drawn from; geometry and depth know none of it."""
     statics: Statics | None = None
     """None: every primitive that stands is a thing of its own."""
+    meshes: tuple[PlacedMesh, ...] = ()
+    """Those that cameras see, in the order of their obstacles, all of which stand still."""
 
     @cached_property
     def look(self) -> Drawn:
@@ -97,6 +117,11 @@ class Arena:
             self.wall_colour,
             self.statics,
         )
+
+    def mesh_of(self, i: int) -> PlacedMesh | None:
+        """Return the mesh that cameras see in place of obstacle i; None: they see the obstacle."""
+        owners = (each for each in self.meshes if each.first <= i < each.first + each.count)
+        return next(owners, None)
 
     @property
     def n_static(self) -> int:

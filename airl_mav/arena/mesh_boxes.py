@@ -1,9 +1,9 @@
 """An asset from a mesh: boxes along its axes that cover its surface.
 
-Cameras, contacts, planners and renderers know boxes, cylinders and spheres, so a mesh becomes
-boxes: it is cut into cubic cells, those that its surface passes through are taken, a closed one is
-filled, and neighbouring cells are joined. What is covered is no less than the mesh, and at most
-`MeshBoxes.beyond_m` more.
+Contacts and planners know boxes, cylinders and spheres, so a mesh becomes boxes: it is cut into
+cubic cells, those that its surface passes through are taken, a closed one is filled, and
+neighbouring cells are joined. What is covered is no less than the mesh, and at most
+`MeshBoxes.beyond_m` more. Cameras see the mesh itself (`triangles`).
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.ndimage import binary_fill_holes
 
+from airl_mav.arena.triangles import Triangles, areas
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.profiles.assets import MOST_PARTS, Asset, BoxPart
 
@@ -65,6 +66,8 @@ class MeshBoxes:
     """Of the mesh: forward, right, up [m]."""
     closed: bool
     """Whether it has an inside, which is filled."""
+    surface: Triangles
+    """The mesh itself, in its place."""
 
     @property
     def beyond_m(self) -> float:
@@ -105,7 +108,15 @@ def boxes_of_mesh(
     closed = bool(mesh.is_watertight)
     cell_m, parts = _finest(mesh, float(size.max()), closed, most)
     forward, right, height = map(float, size)
-    return MeshBoxes(Asset(parts=parts), cell_m, (forward, right, height), closed)
+    surface = _surface(mesh)
+    return MeshBoxes(Asset(parts=parts), cell_m, (forward, right, height), closed, surface)
+
+
+def _surface(mesh: trimesh.Trimesh) -> Triangles:
+    """Return the triangles of a mesh in its place; those without an area are left out."""
+    vertices = (np.asarray(mesh.vertices, np.float64) * [1.0, 1.0, -1.0]).astype(np.float32)
+    faces = np.asarray(mesh.faces, np.int32)
+    return Triangles(vertices, faces[areas(vertices[faces]) > 0.0])
 
 
 def _finest(

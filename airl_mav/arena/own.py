@@ -48,6 +48,9 @@ def _problem(arena: Arena) -> str | None:
             return f"obstacles.{field} {found.shape}; accepted: {wanted} numbers"
     if len(arena.tours) > n:
         return f"{len(arena.tours)} tours; accepted: at most one an obstacle, {n}"
+    for mesh in arena.meshes:
+        if not 0 <= mesh.first < mesh.first + mesh.count <= arena.n_static or mesh.scale <= 0.0:
+            return f"meshes: accepted: each with obstacles that stand, and a scale > 0; not {mesh}"
     for what, place in (("start", (0.0, 0.0)), ("goal", tuple(np.asarray(arena.goal)))):
         inside = len(place) == 2 and (
             b.north_min < place[0] < b.north_max and b.east_min < place[1] < b.east_max

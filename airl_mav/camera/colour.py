@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 from airl_mav.arena.appearance import FLOOR as FLOOR_ROW
 from airl_mav.arena.appearance import OBSTACLE as OBSTACLE_ROW
 from airl_mav.arena.appearance import WALLS as WALLS_ROW
+from airl_mav.camera.bvh import Meshes, is_owned
+from airl_mav.camera.mesh_shadows import shade_by_meshes
+from airl_mav.camera.mesh_surfaces import shade_meshes
 from airl_mav.camera.primitives import OBSTACLE, Ids
 from airl_mav.camera.projection import MIN_DEPTH_M, Pose
 from airl_mav.camera.raycast import aim, draw_bodies, invert
@@ -89,6 +92,7 @@ def render_colour(
     center: NDArray[np.float64],
     half_size: NDArray[np.float64],
     yaw: NDArray[np.float64],
+    meshes: Meshes | None,
     texture: NDArray[np.int8],
     per_m: NDArray[np.float32],
     offset: NDArray[np.float32],
@@ -103,9 +107,9 @@ def render_colour(
         depth: (height, width) depth [m] as `render_depth` defines it, without a limit of range,
             written; 0: no surface.
         seen: (height, width) what each pixel sees, written: SKY, FLOOR, ... of `primitives`, for an
-            obstacle OBSTACLE + its number.
+            obstacle OBSTACLE + its number, for a mesh that of the first obstacle it owns.
         work: For this size of image.
-        position: As of `render_depth`, with the rest up to `yaw`.
+        position: As of `render_depth`, with the rest up to `meshes`.
         quaternion: (4,).
         focal: Focal length.
         cx: Column of the optical axis.
@@ -116,6 +120,7 @@ def render_colour(
         center: (n, 3).
         half_size: (n, 3).
         yaw: (n,).
+        meshes: Those that are seen; None: there are none.
         texture: (2 + n,) `Finish.texture`.
         per_m: (2 + n,) periods of the pattern for a metre.
         offset: (2 + n, 2) `Finish.offset`.
@@ -129,9 +134,11 @@ def render_colour(
     view, axes = aim(lines, xs, quaternion, focal, cx, cy, cylindrical, RANGE_M)
     far, ids = (work.far, work.ids) if cylindrical else (depth, seen)
     rectangles = np.zeros((len(shape), 3, 4), np.int32)
+    faces = None if meshes is None else np.empty(far.shape, np.int32)
     inside = draw_bodies(
-        far, ids, rectangles, lines, xs, view, axes, camera, bounds, shape, center, half_size, yaw
-    )
+        far, ids, rectangles, lines, xs, view, axes, camera, bounds, shape, center, half_size, yaw,
+        meshes, faces,
+    )  # fmt: skip
     if inside >= 0:
         rgb[:, :, :] = 0
         depth[:, :] = MIN_DEPTH_M
@@ -148,11 +155,17 @@ def render_colour(
     sunny = max(max(light.sun[0], light.sun[1]), light.sun[2]) > ZERO
     for i in range(len(shape)):
         if sunny:
+            if is_owned(meshes, i):
+                continue
             world, half = _placed(axes, camera, center, half_size, i)
             shade_by_obstacle(
                 lit, far, ids, work.corners, i, lines, xs, view, world, camera, shape[i], half,
                 yaw[i], to_sun,
             )  # fmt: skip
+    if meshes is not None and faces is not None and sunny:
+        shade_by_meshes(
+            lit, far, ids, faces, work.corners, lines, xs, view, axes, camera, meshes, to_sun
+        )
     draw_sky(out, all_ids, points, rays, camera, light)
     pixel2 = F32(1.0 / (focal * focal))
     floor = surface_of(texture, per_m, offset, albedo, FLOOR_ROW)
@@ -163,7 +176,14 @@ def render_colour(
     shade_walls(
         out, all_ids, all_far, all_lit, all_clear, points, rays, camera, walls, light, atlas, pixel2
     )
+    if meshes is not None and faces is not None:
+        shade_meshes(
+            out, all_ids, all_far, all_lit, all_clear, points, rectangles, meshes, faces.ravel(),
+            lines, xs, axes, camera, texture, per_m, offset, albedo, light, atlas, pixel2,
+        )  # fmt: skip
     for i in range(len(shape)):
+        if is_owned(meshes, i):
+            continue
         world, half = _placed(axes, camera, center, half_size, i)
         surface = surface_of(texture, per_m, offset, albedo, OBSTACLE_ROW + i)
         for k in range(3 if cylindrical else 1):

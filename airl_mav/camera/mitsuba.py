@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.arena.appearance import FLOOR, OBSTACLE, TEXTURES, WALLS, Finish, Light, srgb_of
-from airl_mav.arena.geometry import Arena, Shape
+from airl_mav.arena.geometry import Arena, PlacedMesh, Shape
+from airl_mav.arena.triangles import standing, triangles_of
 from airl_mav.camera.colour import RANGE_M
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.textures import PERIOD, means, pattern
@@ -159,7 +160,11 @@ def _bodies(mi: Any, arena: Arena, centers: Floats) -> dict[str, Any]:
         made.append(_face(mi, finish, WALLS, at, half_e * y, half_h * z))
         at = np.array([north, east + side * half_e, -half_h])
         made.append(_face(mi, finish, WALLS, at, half_n * x, half_h * z))
+    for each in arena.meshes:
+        made.append(_mesh(mi, finish, OBSTACLE + each.first, each))
     for i in range(len(o)):
+        if arena.mesh_of(i) is not None:
+            continue
         row, half, at = OBSTACLE + i, o.half_size[i], centers[i]
         if o.shape[i] == Shape.BOX:
             made += _box(mi, finish, row, at, half, float(o.yaw[i]))
@@ -246,6 +251,30 @@ def _sphere(mi: Any, finish: Finish, row: int, center: Floats, radius: float) ->
     # Its second place goes from the pole at +z, down, to the other one.
     bsdf = _material(mi, finish, row, (around, -0.5 * around), (begin[0], begin[1] + 0.25 * around))
     return {"type": "sphere", "center": center.tolist(), "radius": radius, "bsdf": bsdf}
+
+
+def _mesh(mi: Any, finish: Finish, row: int, placed: PlacedMesh) -> Any:
+    """Return a mesh of flat triangles. Its pattern lies on them as `mesh_surfaces` has it."""
+    held = triangles_of(placed.file)
+    corners = placed.scale * held.corners.astype(np.float64)
+    normals = np.abs(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    q0, q1, q2 = normals.T[..., None]
+    level = q2 >= np.maximum(q0, q1)
+    across = np.where(level | (q1 > q0), corners[..., 0], corners[..., 1])
+    along = np.where(level, corners[..., 1], corners[..., 2])
+    # Both in periods: nothing is left for the texture to do.
+    places = _per_m(finish, row) * np.stack([across, along], axis=-1) + finish.offset[row]
+    properties = mi.Properties()
+    properties["mesh_bsdf"] = mi.load_dict(_material(mi, finish, row, (1.0, 1.0), (0.0, 0.0)))
+    count = len(held)
+    mesh = mi.Mesh("mesh", 3 * count, count, has_vertex_texcoords=True, props=properties)
+    vertices, faces = standing(placed)
+    data = mi.traverse(mesh)
+    data["vertex_positions"] = vertices[faces].astype(np.float32).ravel()
+    data["vertex_texcoords"] = places.astype(np.float32).ravel()
+    data["faces"] = np.arange(3 * count, dtype=np.uint32)
+    data.update()
+    return mesh
 
 
 def _per_m(finish: Finish, row: int) -> float:

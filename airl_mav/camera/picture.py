@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from airl_mav.arena.appearance import FLOOR as FLOOR_ROW
 from airl_mav.arena.appearance import TEXTURES, Drawn, linear_of, srgb_of
 from airl_mav.arena.geometry import Arena
+from airl_mav.camera.bvh import meshes_of
 from airl_mav.camera.colour import Work, render_colour
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.textures import PERIOD, atlas, means
@@ -71,6 +72,9 @@ def render_picture(
     """Return the colour image of an arena, with depth and what is seen; arguments as of `render`.
 
     Depth has no limit of range.
+
+    Raises:
+        UsageError: The file of a mesh cannot be read, or is another one.
     """
     k, obstacles, look = intrinsics, arena.obstacles, ColourArrays.of(arena.look)
     shape = (k.height, k.width)
@@ -94,6 +98,7 @@ def render_picture(
         centers,
         obstacles.half_size,
         obstacles.yaw,
+        meshes_of(arena.meshes, len(obstacles)),
         look.texture,
         look.per_m,
         look.offset,

@@ -22,6 +22,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.camera.bvh import Meshes, is_owned
+from airl_mav.camera.meshes import Faces, draw_meshes
 from airl_mav.camera.primitives import (
     BOX,
     CYLINDER,
@@ -178,6 +180,8 @@ def draw_bodies(
     center: NDArray[np.float64],
     half_size: NDArray[np.float64],
     yaw: NDArray[np.float64],
+    meshes: Meshes | None,
+    faces: Faces | None,
 ) -> int:
     """Write the inverse depth of an arena, line by line; 0 = no return.
 
@@ -197,6 +201,8 @@ def draw_bodies(
         center: (n, 3).
         half_size: (n, 3).
         yaw: (n,).
+        meshes: As of `render_depth`.
+        faces: (n, m) written where a mesh is seen: which of its triangles; None: nobody asks.
 
     Returns:
         Which obstacle the camera is inside of; -1: of none.
@@ -210,6 +216,8 @@ def draw_bodies(
     forward, across, along = axes.forward, axes.across, axes.along
     draw_room(out, ids, lines, xs, view, Pose(forward, across, along, room), half_room)
     for i in range(len(shape)):
+        if is_owned(meshes, i):
+            continue
         offset = (center[i, 0] - camera[0], center[i, 1] - camera[1], center[i, 2] - camera[2])
         half = (half_size[i, 0], half_size[i, 1], half_size[i, 2])
         pose = Pose(forward, across, along, offset)
@@ -217,6 +225,8 @@ def draw_bodies(
         number = OBSTACLE + i
         if _draw_obstacle(out, ids, kept, number, lines, xs, view, pose, shape[i], half, yaw[i]):
             return i
+    if meshes is not None:
+        draw_meshes(out, ids, faces, drawn_in, lines, xs, view, axes, camera, meshes)
     return -1
 
 
@@ -235,13 +245,15 @@ def render_depth(
     center: NDArray[np.float64],
     half_size: NDArray[np.float64],
     yaw: NDArray[np.float64],
+    meshes: Meshes | None,
 ) -> None:
     """Render the depth image of an arena.
 
     The floor is the rectangle of the bounds at z = 0. The walls are thin, stand on its edges and
     are seen from both sides; a ray that passes over them has no return. A camera less than
     `MIN_DEPTH_M` above the floor is lifted to that height (a resting vehicle sinks in by the
-    contact's penetration). From inside an obstacle every pixel reads `MIN_DEPTH_M`.
+    contact's penetration). From inside an obstacle every pixel reads `MIN_DEPTH_M`. In place of the
+    obstacles that a mesh owns its triangles are seen, from inside as well.
 
     Args:
         out: (height, width) depth [m], written; 0 = no return. Along the optical axis of a pinhole,
@@ -259,6 +271,7 @@ def render_depth(
         center: (n, 3) NED [m].
         half_size: (n, 3) as in `Obstacles` [m].
         yaw: (n,) heading of a box's first axis [rad].
+        meshes: Those that are seen; None: there are none, and nothing is spent on them.
     """
     camera = (position[0], position[1], min(position[2], -MIN_DEPTH_M))
     height, width = out.shape
@@ -268,8 +281,9 @@ def render_depth(
     # A cylinder's is drawn column by column, each in one piece; `out` gets them at the end.
     drawn = np.empty((width, height), np.float32) if cylindrical else out
     inside = draw_bodies(
-        drawn, None, None, lines, xs, view, axes, camera, bounds, shape, center, half_size, yaw
-    )
+        drawn, None, None, lines, xs, view, axes, camera, bounds, shape, center, half_size, yaw,
+        meshes, None,
+    )  # fmt: skip
     if inside >= 0:
         out[:, :] = MIN_DEPTH_M
         return

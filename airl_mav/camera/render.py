@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena
+from airl_mav.camera.bvh import meshes_of
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.raycast import render_depth
 from airl_mav.core.kernels import kernel
@@ -63,6 +64,9 @@ def render(
         max_range: Greatest depth that gives a return [m].
         position: (3,) camera NED [m].
         quaternion: (4,) unit [w, x, y, z] camera -> NED; its x axis is the optical axis.
+
+    Raises:
+        UsageError: The file of a mesh cannot be read, or is another one.
     """
     k, obstacles = intrinsics, arena.obstacles
     image = np.empty((k.height, k.width), np.float32)
@@ -80,5 +84,6 @@ def render(
         centers,
         obstacles.half_size,
         obstacles.yaw,
+        meshes_of(arena.meshes, len(obstacles)),
     )
     return image

@@ -149,7 +149,7 @@ def shade_by_obstacle(
     top, bottom, left, end = 0, len(lines), 0, len(xs)
     if not view.cylindrical:
         floor = -(world.center[2] + camera[2])
-        top, bottom, left, end = _shadow_rectangle(
+        top, bottom, left, end = shadow_rectangle(
             corners, len(lines), len(xs), view, pose, half, sun, floor
         )
     if top >= bottom or left >= end:
@@ -204,7 +204,7 @@ def shade_by_obstacle(
 
 
 @kernel
-def _shadow_rectangle(
+def shadow_rectangle(
     corners: NDArray[np.float64],
     n_lines: int,
     n_pixels: int,

@@ -55,11 +55,13 @@ FOG_LAYER_M: Final = 100.0
 """Height of the fog above the floor, seen towards the sky [m]."""
 
 _TURN: Final = 2.0 * math.pi
-_STEEP: Final = F32(0.02)  # least cosine between ray and normal for the size of a pixel
+
+STEEP: Final = F32(0.02)
+"""Least cosine between ray and normal for the size of a pixel."""
 
 
 @kernel
-def _span(
+def span_of(
     ids: Ids, low: int, high: int, left: int, end: int, first: np.int32, last: np.int32
 ) -> tuple[int, int]:
     """Return the pixels left..end from the first to the last that sees a surface.
@@ -104,7 +106,7 @@ def draw_sky(out: Packed, ids: Ids, points: Points, rays: Rays, camera: Vec, lig
     above = F32(max(-camera[2], MIN_DEPTH_M))
     zenith, horizon, ground = light.zenith, light.horizon, light.ground
     rises, clear = points.up, points.pattern
-    begin, stop = _span(ids, 0, len(ids), 0, len(ids), I32(SKY), I32(SKY))
+    begin, stop = span_of(ids, 0, len(ids), 0, len(ids), I32(SKY), I32(SKY))
     for left in range(begin, stop, BLOCK):
         end = min(left + BLOCK, stop)
         row, norths, easts, downs = (
@@ -134,7 +136,7 @@ def draw_sky(out: Packed, ids: Ids, points: Points, rays: Rays, camera: Vec, lig
 
 
 @kernel
-def _texels2(surface: Surface, pixel2: np.float32) -> np.float32:
+def texels2(surface: Surface, pixel2: np.float32) -> np.float32:
     """Return the square of the texels of the finest level that a pixel covers 1 m away, head on."""
     texels = F32(SIDE) * surface.per_m
     return texels * texels * pixel2
@@ -159,9 +161,9 @@ def shade_floor(
     at0, at1 = F32(camera[0]), F32(camera[1])
     sun_up = -light.to_sun[2]
     # The camera's height is t times the ray's slope.
-    texel = _texels2(floor, pixel2) / F32(max(-camera[2], MIN_DEPTH_M))
+    texel = texels2(floor, pixel2) / F32(max(-camera[2], MIN_DEPTH_M))
     own = I32(FLOOR)
-    begin, stop = _span(ids, 0, len(ids), 0, len(ids), own, own)
+    begin, stop = span_of(ids, 0, len(ids), 0, len(ids), own, own)
     for left in range(begin, stop, BLOCK):
         end = min(left + BLOCK, stop)
         depths, norths, easts = far[left:end], rays.north[left:end], rays.east[left:end]
@@ -193,9 +195,9 @@ def shade_walls(
     """Shade the walls. Their pattern begins at the foot, north and east of the start."""
     at0, at1, at2 = F32(camera[0]), F32(camera[1]), F32(camera[2])
     sun0, sun1 = light.to_sun[0], light.to_sun[1]
-    texel = _texels2(walls, pixel2)
+    texel = texels2(walls, pixel2)
     first, last = I32(WALL_NORTH_SOUTH), I32(WALL_EAST_WEST)
-    begin, stop = _span(ids, 0, len(ids), 0, len(ids), first, last)
+    begin, stop = span_of(ids, 0, len(ids), 0, len(ids), first, last)
     for left in range(begin, stop, BLOCK):
         end = min(left + BLOCK, stop)
         seen, depths = ids[left:end], far[left:end]
@@ -207,7 +209,7 @@ def shade_walls(
             to_sun = -to_sun if normal > ZERO else to_sun
             across = (at1 + t * e if north else at0 + t * n) * walls.per_m + walls.offset[0]
             along = (at2 + t * d) * walls.per_m + walls.offset[1]
-            texels = texel * t * t / max(abs(normal), _STEEP)
+            texels = texel * t * t / max(abs(normal), STEEP)
             points.place[u] = texel_at(across, along, texels)
             points.facing[u] = max(to_sun, ZERO)
             points.up[u] = ZERO
@@ -248,7 +250,7 @@ def shade_obstacle(
     s1 = F32(cos * light.to_sun[1] - sin * light.to_sun[0])
     s2 = light.to_sun[2]
     per0, per1, per2 = F32(1.0 / half[0]), F32(1.0 / half[1]), F32(1.0 / half[2])
-    texel, radius = _texels2(surface, pixel2), F32(half[0])
+    texel, radius = texels2(surface, pixel2), F32(half[0])
     per_m, begin_u, begin_v = surface.per_m, surface.offset[0], surface.offset[1]
     per_turn = F32(max(np.rint(_TURN * half[0] * per_m), 1.0))
     place, facing, ups, _ = points
@@ -256,7 +258,7 @@ def shade_obstacle(
     for v in range(rectangle[0], rectangle[1]):
         line = v * len(xs)
         low, high = line + rectangle[2], line + rectangle[3]
-        left, end = _span(ids, line, line + len(xs), low, high, own, own)
+        left, end = span_of(ids, line, line + len(xs), low, high, own, own)
         if end == 0:
             continue
         x_row, far_row = xs[left - line : end - line], far[left:end]
@@ -276,7 +278,7 @@ def shade_obstacle(
                 up = ONE if c < ZERO else -ONE
                 across = a if on_c else (b if on_a else a)
                 along = b if on_c else c
-                texels = texel * t * t / max(abs(normal), _STEEP)
+                texels = texel * t * t / max(abs(normal), STEEP)
                 place[u] = texel_at(across * per_m + begin_u, along * per_m + begin_v, texels)
                 facing[u] = max(to_sun, ZERO)
                 ups[u] = up if on_c else ZERO
@@ -292,7 +294,7 @@ def shade_obstacle(
                 up = ONE if c < ZERO else -ONE
                 across = a * per_m if cap else turn_of(b, a) * per_turn
                 along = (b if cap else c) * per_m
-                texels = texel * t * t / max(abs(normal), _STEEP)
+                texels = texel * t * t / max(abs(normal), STEEP)
                 place[u] = texel_at(across + begin_u, along + begin_v, texels)
                 facing[u] = max(to_sun, ZERO)
                 ups[u] = up if cap else ZERO
@@ -305,7 +307,7 @@ def shade_obstacle(
                 to_sun = (a * s0 + b * s1 + c * s2) * per0
                 across = turn_of(b, a) * per_turn
                 along = turn_of(c, np.sqrt(a * a + b * b)) * per_turn
-                texels = texel * t * t / max(abs(normal), _STEEP)
+                texels = texel * t * t / max(abs(normal), STEEP)
                 place[u] = texel_at(across + begin_u, along + begin_v, texels)
                 facing[u] = max(to_sun, ZERO)
                 ups[u] = min(max(-c * per0, -ONE), ONE)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import tempfile
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tomli_w
 from pydantic import Field
@@ -18,6 +19,7 @@ from airl_mav.core.files import replace_file
 from airl_mav.profiles.arena import ASSET_NAME, SHAPES, ArenaSpec
 from airl_mav.profiles.assets import MOST_PARTS
 from airl_mav.profiles.loading import load_profile
+from airl_mav.profiles.mesh_file import MOST_TRIANGLES, MeshFile
 from airl_mav.scenario.model import DEFAULT_ARENA, ArenaName
 
 if TYPE_CHECKING:
@@ -27,14 +29,16 @@ EXTRAS = ("mesh",)
 
 
 class AssetOptions(ProfileModel):
-    """Make an arena profile whose obstacles are a mesh, as boxes that cover it.
+    """Make an arena profile whose obstacles are a mesh, and boxes that cover it.
 
-    Every camera, plant and planner knows boxes. The cells that the mesh is cut into are as fine as
-    the number of boxes allows; what the boxes cover beyond the mesh is told.
+    Cameras see the mesh; plants and planners know the boxes. The cells that the mesh is cut into
+    are as fine as the number of boxes allows; what the boxes cover beyond the mesh is told. The
+    mesh's triangles are written beside the profile, into a file of the same name that ends in .npz.
 
     Examples:
         airl asset pillar.stl --out pillars.toml
         airl asset shelf.glb --most 64 --arena dense-obstacles --out shelves.toml
+        airl asset scan.ply --seen boxes --out scans.toml
         airl render pillars.toml --seed 3 --out pillars.png
     """
 
@@ -52,6 +56,11 @@ class AssetOptions(ProfileModel):
     scale: float = quantity("metres per unit of the file", "m", gt=0, le=1e6, default=1.0)
     up: Literal["auto", "y", "z"] = Field(
         default="auto", description="axis of the file that points up; auto: y for .glb, else z"
+    )
+    seen: Literal["mesh", "boxes"] = Field(
+        default="mesh",
+        description=f"what cameras see: the mesh, of at most {MOST_TRIANGLES:,} triangles, or the"
+        " boxes",
     )
 
 
@@ -72,20 +81,24 @@ def run(options: AssetOptions, console: Console | None = None) -> int:
         raise FieldError("out", f"{options.out}", "a file name that ends in .toml")
     name = _name(options)
     made = boxes_of_mesh(options.mesh, most=options.most, scale=options.scale, up=options.up)
-    text = _profile(options, name, made)
+    surface = options.out.with_suffix(".npz") if options.seen == "mesh" else None
+    files = _files(options, name, made, surface)
     with tempfile.TemporaryDirectory() as folder:
-        tried = Path(folder) / options.out.name
-        tried.write_text(text, encoding="utf-8")
-        load_profile("arenas", str(tried), ArenaSpec)  # before anything is written for good
+        for path, data in files.items():
+            (Path(folder) / path.name).write_bytes(data)
+        # Before anything is written for good.
+        load_profile("arenas", str(Path(folder) / options.out.name), ArenaSpec)
     try:
-        replace_file(options.out, text.encode())
+        for path, data in files.items():
+            replace_file(path, data)
     except OSError as error:
         raise FieldError(
             "out", f"{options.out}", problem=f"cannot write: {error.strerror}"
         ) from None
+    seen = "the boxes" if surface is None else f"its {len(made.surface):,} triangles"
     console.print(
-        f"{name}: {_told(made)}",
-        f"written: {options.out}",
+        f"{name}: {_told(made)}; cameras see {seen}",
+        f"written: {' and '.join(str(path) for path in files)}",
         sep="\n",
         soft_wrap=True,
         highlight=False,
@@ -113,16 +126,41 @@ def _told(made: MeshBoxes) -> str:
     )
 
 
-def _profile(options: AssetOptions, name: str, made: MeshBoxes) -> str:
+def _files(
+    options: AssetOptions, name: str, made: MeshBoxes, surface: Path | None
+) -> dict[Path, bytes]:
+    """Return what is written where: the profile, and before it the file of the triangles.
+
+    Raises:
+        FieldError: There are too many triangles.
+    """
+    from airl_mav.arena.triangles import encoded
+
+    if surface is None:
+        return {options.out: _profile(options, name, made, None).encode()}
+    if len(made.surface) > MOST_TRIANGLES:
+        raise FieldError(
+            "mesh",
+            f"{options.mesh}",
+            f"at most {MOST_TRIANGLES:,} triangles, not {len(made.surface):,}, unless cameras shall"
+            " see its boxes (--seen boxes)",
+        )
+    data = encoded(made.surface)
+    held = MeshFile(file=surface.name, sha256=hashlib.sha256(data).hexdigest())
+    return {surface: data, options.out: _profile(options, name, made, held).encode()}
+
+
+def _profile(options: AssetOptions, name: str, made: MeshBoxes, held: MeshFile | None) -> str:
     arena = options.arena
     base = str(Path(arena).absolute()) if arena.endswith(".toml") else arena
-    parts = [
+    asset: dict[str, Any] = {} if held is None else {"mesh": held.model_dump()}
+    asset["parts"] = [
         part.model_dump(exclude_defaults=True) | {"shape": part.shape} for part in made.asset.parts
     ]
     data = {
         "base": base,
         "description": f"{name}, from {options.mesh.name}",
         "static": {"shapes": [name]},
-        "assets": {name: {"parts": parts}},
+        "assets": {name: asset},
     }
     return f"# airl asset {options.mesh.name}: {_told(made)}\n" + tomli_w.dumps(data)

@@ -23,6 +23,7 @@ from airl_mav.envs.arenas import ArenaBatch, move_obstacles
 from airl_mav.envs.colour_images import ColourImages, Looks
 from airl_mav.envs.faults import BEFORE_US, TwinFault, later_us, twin_faults
 from airl_mav.envs.fleet import Fleet
+from airl_mav.envs.meshes import MeshBatch, MeshesSeen, meshes_in
 from airl_mav.envs.saved_state import Stateful
 from airl_mav.faults.kinds import NOISE_SEED
 from airl_mav.faults.model import Fault
@@ -65,6 +66,7 @@ class Cameras(Stateful):
         noise: SensorNoise,
         faults: Sequence[Fault] = (),
         looks: Looks | None = None,
+        meshes: MeshesSeen | None = None,
     ) -> None:
         """Make n cameras.
 
@@ -75,6 +77,7 @@ class Cameras(Stateful):
             noise: Conditions that their images are taken in.
             faults: Those of the camera happen to all of them.
             looks: How their arenas look, which colour cameras need.
+            meshes: Those of their arenas; None: there are none.
         """
         self.intrinsics = Intrinsics.of(camera)
         self.image = np.zeros((n, *self.intrinsics.shape), self.intrinsics.dtype)
@@ -86,11 +89,12 @@ class Cameras(Stateful):
             (camera.forward_m, 0.0, -camera.up_m), float(np.deg2rad(camera.pitch_up_deg))
         )
         self._lens = lens_of(self.intrinsics, camera.range_m)
+        self._meshes = MeshesSeen(0) if meshes is None else meshes
         self._colour: ColourImages | None = None
         """None: the cameras see depth."""
         if self.intrinsics.kind != "depth":
             assert looks is not None  # noqa: S101 - whoever makes colour cameras has arenas for them
-            self._colour = ColourImages(self.intrinsics, self._mount, looks)
+            self._colour = ColourImages(self.intrinsics, self._mount, looks, self._meshes)
         self._first_us = np.zeros(n, np.int64)
         failing = twin_faults(faults, "camera")
         self._late = [each for each in failing if each.fault.kind == "delay"]
@@ -214,7 +218,7 @@ class Cameras(Stateful):
     ) -> None:
         """Write the images of the vehicles in `who` (n,), without noise."""
         if self._colour is None:
-            render_images(fleet, arenas, who, self._mount, self._lens, out)
+            render_images(fleet, arenas, who, self._mount, self._lens, out, self._meshes.batch)
         else:
             self._colour.render(fleet, arenas, who, out)
 
@@ -246,6 +250,7 @@ def render_images(
     mount: Mount,
     lens: Lens,
     out: NDArray[np.uint16],
+    meshes: MeshBatch | None,
 ) -> None:
     """Render the depth image of every vehicle in `who`, from where it is now.
 
@@ -257,6 +262,7 @@ def render_images(
         lens: The camera.
         out: (n, height, width) depth [mm], written; 0 = no return. Rounded and clipped as
             `camera.frame.depth_to_z16` does.
+        meshes: Those of the arenas; None: there are none.
     """
     image = np.empty(out.shape[1:], np.float32)
     for i in range(len(who)):
@@ -279,6 +285,7 @@ def render_images(
             arenas.center[i, :count],
             arenas.half_size[i, :count],
             arenas.yaw[i, :count],
+            None if meshes is None else meshes_in(meshes, i, count),
         )
         _to_z16(image, out[i])
 

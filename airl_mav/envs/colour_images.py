@@ -18,6 +18,7 @@ from airl_mav.camera.textures import atlas
 from airl_mav.core.kernels import kernel
 from airl_mav.envs.arenas import ArenaBatch, copy_rows, move_obstacles
 from airl_mav.envs.fleet import Fleet
+from airl_mav.envs.meshes import MeshBatch, MeshesSeen, meshes_in
 
 
 class LookBatch(NamedTuple):
@@ -71,11 +72,13 @@ class Looks:
 class ColourImages:
     """Renders the images of n vehicles with one colour camera each."""
 
-    def __init__(self, intrinsics: Intrinsics, mount: Mount, looks: Looks) -> None:
-        """Take the camera, its place on the body, and how the arenas look."""
+    def __init__(
+        self, intrinsics: Intrinsics, mount: Mount, looks: Looks, meshes: MeshesSeen
+    ) -> None:
+        """Take the camera, its place on the body, how the arenas look, and their meshes."""
         k = intrinsics
         self._lens = (k.focal, k.cx, k.cy, k.cylindrical)
-        self._mount, self._looks = mount, looks
+        self._mount, self._looks, self._meshes = mount, looks, meshes
         self._work = Work.of(k.width, k.height, k.cylindrical)
         shape = (k.height, k.width)
         self._rgb = np.zeros((*shape, 3), np.uint8)
@@ -87,7 +90,16 @@ class ColourImages:
         """Write the images (n, h, w, 3), or (n, h, w, 1) in grey, of the vehicles in `who` (n,)."""
         room = self._work, self._rgb, self._depth, self._seen
         render_colour_images(
-            fleet, arenas, self._looks.batch, who, self._mount, *self._lens, *room, atlas(), out
+            fleet,
+            arenas,
+            self._looks.batch,
+            self._meshes.batch,
+            who,
+            self._mount,
+            *self._lens,
+            *room,
+            atlas(),
+            out,
         )
 
 
@@ -96,6 +108,7 @@ def render_colour_images(
     fleet: Fleet,
     arenas: ArenaBatch,
     looks: LookBatch,
+    meshes: MeshBatch | None,
     who: NDArray[np.bool_],
     mount: Mount,
     focal: float,
@@ -115,6 +128,7 @@ def render_colour_images(
         fleet: Poses and times.
         arenas: One a vehicle; moving obstacles are put where they are at its time.
         looks: One an arena.
+        meshes: Those of the arenas; None: there are none.
         who: (n,) whose image is rendered; the others' stays as it is.
         mount: The camera's place on the body.
         focal: Focal length [px], or columns for an angle of a cylinder [px/rad].
@@ -153,6 +167,7 @@ def render_colour_images(
             arenas.center[i, :count],
             arenas.half_size[i, :count],
             arenas.yaw[i, :count],
+            None if meshes is None else meshes_in(meshes, i, count),
             looks.texture[i, :surfaces],
             looks.per_m[i, :surfaces],
             looks.offset[i, :surfaces],

@@ -14,6 +14,7 @@ from airl_mav.core.errors import UsageError
 from airl_mav.envs.arenas import batch_of, put_arena, with_room
 from airl_mav.envs.colour_images import Looks
 from airl_mav.envs.curriculum import check_stage, stages_of
+from airl_mav.envs.meshes import MeshesSeen
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.profiles.arena import ArenaSpec
 
@@ -57,6 +58,8 @@ class EpisodeArenas:
         """What the kernels look at; replaced where an arena is larger than all before."""
         self.looks = Looks(n) if looks else None
         """How they look; None: nobody asks."""
+        self.meshes = MeshesSeen(n)
+        """Those that cameras see."""
         self._ahead: dict[tuple[int, int | None], Arena] = {}
         """Arenas that were made ahead, by seed and zone."""
 
@@ -69,6 +72,7 @@ class EpisodeArenas:
         arena = self._ahead.pop((seed, zone), None) or self._made(seed, zone)
         self.present[i], self.begun[i] = arena, True
         self.seeds[i], self.zones[i] = seed, -1 if zone is None else zone
+        self.meshes.put(i, arena)
         if self.looks is not None:
             self.looks.put(i, arena)
         if len(self.batch.bounds) == 0:
@@ -106,6 +110,7 @@ class EpisodeArenas:
         spare = next((arena for arena in self.present if arena is not None), None)
         room = [spare if arena is None else arena for arena in self.present]
         self.batch = batch_of([arena for arena in room if arena is not None])
+        self.meshes.restore(self.present)
         if self.looks is not None:
             self.looks.restore(self.present)
 

@@ -204,7 +204,13 @@ class Navigation(Stateful):
         check_twin(faults, pipelined=spec.decisions == "pipelined")
         self._winds = Winds(n, spec.wind, faults)
         self.cameras = Cameras(
-            n, self.camera, self._transport_us, randomisation, faults, self._places.looks
+            n,
+            self.camera,
+            self._transport_us,
+            randomisation,
+            faults,
+            self._places.looks,
+            self._places.meshes,
         )
         self._uplink = twin_faults(faults, "uplink")
         self._timing: SequentialTiming | PipelinedTiming

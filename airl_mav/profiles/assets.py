@@ -8,11 +8,12 @@ common things of their kind, in round numbers.
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
 from airl_mav.core.fields import ProfileModel, quantity
+from airl_mav.profiles.mesh_file import MeshFile
 
 MOST_PARTS = 128
 """Parts of one asset: every ray and every contact looks at each."""
@@ -97,6 +98,19 @@ class Asset(ProfileModel):
     parts: Annotated[tuple[Part, ...], Field(min_length=1, max_length=MOST_PARTS)] = Field(
         description="boxes, cylinders and spheres, each with its shape, place and size"
     )
+    mesh: MeshFile | None = Field(
+        default=None,
+        description="triangles that cameras see in place of the parts; its material is that of the"
+        " first part",
+    )
+
+    @model_serializer(mode="wrap")
+    def _without_unused(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out a mesh where there is none: the arena's digest is that of before there were."""
+        data: dict[str, Any] = dump(self)
+        if self.mesh is None:
+            del data["mesh"]
+        return data
 
     @property
     def top_m(self) -> float:

@@ -13,6 +13,7 @@ from pydantic import BaseModel
 from airl_mav.core.errors import UsageError, shown
 from airl_mav.core.fields import validated
 from airl_mav.core.files import DEEPEST, deeper_than
+from airl_mav.profiles.mesh_file import CONTENT, MeshFile, read_checked
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -70,12 +71,16 @@ def load_profile(kind: Kind, name: str, model: type[Model]) -> Model:
     """
     path = _path(kind, name)
     data = _read(kind, path, ())
-    return validated(model, data, path)
+    profile = validated(model, data, path)
+    for asset in getattr(profile, "assets", {}).values():
+        if asset.mesh is not None:
+            _check_mesh(asset.mesh, path)
+    return profile
 
 
 def profile_digest(profile: BaseModel) -> str:
     """Return the SHA-256 of a profile's content, hexadecimal: its name does not tell a change."""
-    return hashlib.sha256(profile.model_dump_json().encode()).hexdigest()
+    return hashlib.sha256(profile.model_dump_json(context=CONTENT).encode()).hexdigest()
 
 
 def _path(kind: Kind, name: str) -> Path:
@@ -98,6 +103,8 @@ def _read(kind: Kind, path: Path, above: tuple[Path, ...]) -> dict[str, Any]:
     data = read_toml(path)
     if kind == "vehicles":
         _name_power_model(data, path)
+    if kind == "arenas":
+        _anchor_meshes(data, path)
     base = data.pop("base", None)
     if base is None:
         return data
@@ -125,6 +132,23 @@ def read_toml(path: Path) -> dict[str, Any]:
     if too_deep:
         raise UsageError(f"{path}: nested too deep: accepted: {DEEPEST} levels")
     return found
+
+
+def _anchor_meshes(data: dict[str, Any], path: Path) -> None:
+    """Make paths to the meshes of assets absolute: they are told from their profile's folder."""
+    assets = data.get("assets")
+    for asset in assets.values() if isinstance(assets, dict) else ():
+        mesh = asset.get("mesh") if isinstance(asset, dict) else None
+        if isinstance(mesh, dict) and isinstance(file := mesh.get("file"), str) and file:
+            mesh["file"] = str(path.parent.absolute() / file)
+
+
+def _check_mesh(mesh: MeshFile, path: Path) -> None:
+    """Raise UsageError, in the name of the profile, where a mesh is gone or another one."""
+    try:
+        read_checked(mesh)
+    except UsageError as error:
+        raise UsageError(f"{path}: assets: {error}") from None
 
 
 def _name_power_model(data: dict[str, Any], path: Path) -> None:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.draw import GOAL_COLOUR, MOVING_COLOURS, START_COLOUR
 from airl_mav.arena.geometry import Arena, Obstacles, Shape
+from airl_mav.arena.triangles import drawn, standing
 from airl_mav.core.constants import US_PER_S
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
@@ -39,6 +40,9 @@ ALL_FLIGHTS = 150
 
 CORNERS = 12
 """Of a drawn circle."""
+
+MOST_TRIANGLES = 20_000
+"""Of the meshes of one view: a page holds the views of many flights."""
 
 VIEW_M = 6.0
 """Length of the drawn field of view."""
@@ -288,9 +292,15 @@ def _arena_traces(arena: Arena, *, obstacles: bool = True) -> list[Trace]:
         _mesh([(walls, np.array(faces))], f"rgb({red},{green},{blue})", "wall", opacity=0.12),
     ]
     if obstacles and arena.n_static:
+        shown = drawn(arena.meshes, MOST_TRIANGLES)
         still = [
-            body_mesh(arena.obstacles, i, arena.obstacles.center[i]) for i in range(arena.n_static)
+            body_mesh(arena.obstacles, i, arena.obstacles.center[i])
+            for i in range(arena.n_static)
+            if arena.mesh_of(i) not in shown
         ]
+        for each in shown:
+            places, triangles = standing(each)
+            still.append((_east_north_up(places), triangles.astype(np.int64)))
         traces.append(_mesh(still, STILL_COLOUR, "obstacle"))
     return traces
 

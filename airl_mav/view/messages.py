@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from airl_mav.arena.appearance import Statics
-from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Tour
+from airl_mav.arena.geometry import Arena, Bounds, Obstacles, PlacedMesh, Tour
 from airl_mav.profiles.appearance import DEFAULT, Appearance
+from airl_mav.profiles.mesh_file import MeshFile
 from airl_mav.profiles.projection import Projection
 from airl_mav.profiles.vehicle import Momentum, VehicleProfile
 
@@ -53,6 +54,26 @@ class StaticsShown(Message):
     materials: tuple[str | None, ...]
 
 
+class MeshShown(Message):
+    """A mesh that cameras see, as `arena.geometry.PlacedMesh`: where its file lies."""
+
+    file: MeshFile
+    place: tuple[float, float]
+    yaw: float
+    scale: float
+    first: int
+    count: int
+
+    @classmethod
+    def of(cls, placed: PlacedMesh) -> MeshShown:
+        """Return a mesh as plain numbers."""
+        return cls(**{name: getattr(placed, name) for name in cls.model_fields})
+
+    def placed(self) -> PlacedMesh:
+        """Return the mesh."""
+        return PlacedMesh(self.file, self.place, self.yaw, self.scale, self.first, self.count)
+
+
 class ArenaShown(Message):
     """An arena as plain numbers, as `arena.geometry.Arena`."""
 
@@ -68,6 +89,7 @@ class ArenaShown(Message):
     goal: tuple[float, float]
     appearance: Appearance = DEFAULT
     statics: StaticsShown | None = None
+    meshes: tuple[MeshShown, ...] = ()
 
     @classmethod
     def of(cls, arena: Arena) -> ArenaShown:
@@ -94,6 +116,7 @@ class ArenaShown(Message):
             goal=(north, east),
             appearance=arena.appearance,
             statics=statics,
+            meshes=tuple(map(MeshShown.of, arena.meshes)),
         )
 
     def arena(self) -> Arena:
@@ -116,6 +139,7 @@ class ArenaShown(Message):
             statics=None
             if known is None
             else Statics(known.names, np.array(known.of, np.int64), known.materials),
+            meshes=tuple(each.placed() for each in self.meshes),
         )
 
 

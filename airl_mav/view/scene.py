@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.appearance import OBSTACLE
 from airl_mav.arena.geometry import Arena, Bounds, Shape
+from airl_mav.arena.triangles import drawn, standing
 from airl_mav.core.frames import (
     FRD_FROM_OPTICAL,
     heading_to_ned,
@@ -165,7 +166,20 @@ class FlightScene:
             side="front",
             flat_shading=True,
         )
+        shown = drawn(arena.meshes)
+        for each in shown:
+            places, triangles = standing(each)
+            self._add(
+                "mesh_simple",
+                f"/arena/mesh/{each.first}",
+                *(places.astype(np.float32), triangles.astype(np.uint32)),
+                color=arena.look.finish.colour(OBSTACLE + each.first),
+                side="double",
+                flat_shading=True,
+            )
         for i in range(len(arena.obstacles)):
+            if arena.mesh_of(i) in shown:
+                continue
             moves = i >= arena.n_static
             colour = MOVING if moves else arena.look.finish.colour(OBSTACLE + i)
             node = self._obstacle(arena, i, colour)

@@ -15,6 +15,7 @@ from airl_mav.envs.arenas import batch_of
 from airl_mav.envs.colour_images import ColourImages, Looks
 from airl_mav.envs.encoding import COMPILED
 from airl_mav.envs.fleet import new_fleet
+from airl_mav.envs.meshes import MeshesSeen
 from airl_mav.lockstep.flight import fly
 from airl_mav.policy.actions import Action
 from airl_mav.policy.card import load_card
@@ -123,7 +124,7 @@ def test_the_companion_gets_the_images_that_the_twin_renders(
     looks = Looks(1)
     looks.put(0, arena)
     mount = SimulatedCamera(camera, arena)._mount
-    twin = ColourImages(Intrinsics.of(camera), mount, looks)
+    twin = ColourImages(Intrinsics.of(camera), mount, looks, MeshesSeen(1))
     fleet, arenas, image = new_fleet(1), batch_of([arena]), np.zeros((1, 48, 64, 3), np.uint8)
     spec = learned.card.observation
     for each, capture_us in zip(seen, captures.tolist(), strict=True):

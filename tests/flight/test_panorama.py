@@ -72,7 +72,7 @@ def test_the_companion_gets_the_images_that_the_twin_renders(
         fleet.position[0], fleet.quaternion[0] = poses[capture_us]
         fleet.time_us[0] = capture_us - flown.record.started_us
         render_images(
-            fleet, arenas, np.ones(1, np.bool_), mount, lens_of(lens, camera.range_m), twin
+            fleet, arenas, np.ones(1, np.bool_), mount, lens_of(lens, camera.range_m), twin, None
         )
         assert each.depth_mm.tobytes() == twin[0].tobytes()
     # It is a picture, of all sides, and another one each time.

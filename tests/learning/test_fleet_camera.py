@@ -58,7 +58,7 @@ def test_sees_what_the_rehearsal_s_camera_sees(
 ) -> None:
     fleet, arenas = scattered(np.random.default_rng(1)), batch_of(worlds)
     out = np.full((N, camera.height, camera.width), 7, np.uint16)
-    render_images(fleet, arenas, np.ones(N, np.bool_), MOUNT, lens_of(camera, range_m), out)
+    render_images(fleet, arenas, np.ones(N, np.bool_), MOUNT, lens_of(camera, range_m), out, None)
     for i, world in enumerate(worlds):
         assert np.array_equal(out[i], expected(world, fleet, i, range_m, camera))
     assert len(np.unique(out)) > 1000  # it is a picture
@@ -68,7 +68,7 @@ def test_only_those_that_look_get_an_image(worlds: list[Arena]) -> None:
     fleet, arenas = scattered(np.random.default_rng(2)), batch_of(worlds)
     out = np.full((N, 48, 64), 7, np.uint16)
     who = np.arange(N) % 3 == 1
-    render_images(fleet, arenas, who, MOUNT, lens_of(CAMERA, 20.0), out)
+    render_images(fleet, arenas, who, MOUNT, lens_of(CAMERA, 20.0), out, None)
     for i, world in enumerate(worlds):
         image = expected(world, fleet, i, 20.0) if who[i] else np.full((48, 64), 7)
         assert np.array_equal(out[i], image)
@@ -84,7 +84,8 @@ def test_obstacles_are_seen_where_they_are_at_the_vehicle_s_time() -> None:
         fleet.time_us[0] = time_us
         for i in range(4):
             fleet.quaternion[0] = quat_from_euler(0.0, 0.0, 0.5 * math.pi * i)
-            render_images(fleet, arenas, np.ones(1, np.bool_), MOUNT, lens_of(CAMERA, 40.0), out)
+            one = np.ones(1, np.bool_)
+            render_images(fleet, arenas, one, MOUNT, lens_of(CAMERA, 40.0), out, None)
             assert np.array_equal(out[0], expected(world, fleet, 0, 40.0))
             seen.append(out.copy())
     assert np.array_equal(seen[:4], seen[8:12])
@@ -100,8 +101,8 @@ def test_depth_beyond_16_bits_is_clipped() -> None:
     fleet.position[0] = [0.0, 0.0, -20.0]
     out = np.zeros((1, 9, 9), np.uint16)
     render_images(fleet, arenas, np.ones(1, np.bool_), Mount((10.0, 0.0, 0.0), 0.0),
-         Lens(40.0, 4.0, 4.0, 200.0), out)  # fmt: skip
+         Lens(40.0, 4.0, 4.0, 200.0), out, None)  # fmt: skip
     assert np.all(out == 65_535)
     render_images(fleet, arenas, np.ones(1, np.bool_), Mount((40.0, 0.0, 0.0), 0.0),
-         Lens(40.0, 4.0, 4.0, 200.0), out)  # fmt: skip
+         Lens(40.0, 4.0, 4.0, 200.0), out, None)  # fmt: skip
     assert out[0, 4, 4] == 60_000

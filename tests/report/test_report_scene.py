@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -115,6 +116,21 @@ def test_a_body_is_closed_and_has_the_shape_size_and_place_of_its_obstacle(seed:
         # Every edge belongs to two triangles.
         edges = np.sort(triangles[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
         assert set(np.unique(edges, axis=0, return_counts=True)[1]) == {2}
+
+
+def test_the_view_has_the_triangles_of_meshes(demo: Demo, tmp_path: Path) -> None:
+    pytest.importorskip("trimesh")
+    from airl_mav.arena.triangles import standing
+    from tests.support.meshes import kept, ring, scene_of, triangles
+
+    arena = scene_of(kept(triangles(ring()), tmp_path / "ring.npz"), [(3.0, 2.0, 0.5, 1.5)])
+    run, _ = demo
+    flight = SceneFlight(run.episodes[0], run.trajectories[0], arena)
+    body = trace(flight_view(flight, 5.0, 90.0), "obstacle")
+    places, faces = standing(arena.meshes[0])
+    drawn = np.stack([body["x"], body["y"], body["z"]], axis=1)
+    np.testing.assert_allclose(drawn, places[:, [1, 0, 2]] * [1.0, 1.0, -1.0], atol=0.006)
+    np.testing.assert_array_equal(np.stack([body[axis] for axis in "ijk"], axis=1), faces)
 
 
 def test_the_slider_moves_obstacles_along_their_tours(demo: Demo) -> None:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape, Tour
+from airl_mav.arena.geometry import Arena, Bounds, Obstacles, PlacedMesh, Shape, Tour
+from airl_mav.camera.render import camera_pose
+from airl_mav.core.frames import quat_to_matrix
 from airl_mav.envs.braking import braking_of
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.quality import measure_quality
@@ -240,6 +243,32 @@ def test_the_share_of_a_sphere_is_its_projected_area() -> None:
     assert view.share == pytest.approx(disc / (k.width * k.height), rel=0.08)
     assert view.bearing_rad == pytest.approx(0.0, abs=1e-9)
     assert math.degrees(SIGHT.half_angle_rad) == pytest.approx(0.5 * CAMERA.horizontal_fov_deg)
+
+
+def test_the_share_of_a_mesh_is_that_of_its_triangles(tmp_path: Path) -> None:
+    """A fine ball's is a sphere's, whichever of its boxes was hit, also where another is nearer."""
+    trimesh = pytest.importorskip("trimesh")
+    from tests.support.meshes import kept, triangles
+
+    radius, away = 1.0, 6.0
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=radius)
+    file = kept(triangles(ball), tmp_path / "ball.npz")
+    shapes = [(Shape.BOX, away + CAMERA.forward_m, 0.0, 1.4, 0.0)] * 2
+    arena = arena_of((Shape.BOX, 3.0, 20.0, 1.0, 0.0), *shapes)
+    mesh = PlacedMesh(file, (away + CAMERA.forward_m, 0.0), 0.3, 1.0, 1, 2)
+    arena = replace(arena, meshes=(mesh,))
+    still = flight_of([(0.0, 0.0, 0.0), (1.0, 0.0, 0.0)])
+    # The whole arena, and the mesh alone, each from the same eye.
+    shares = [view_obstacle(still, 0, 1_000_000, arena, 0, i, SIGHT).share for i in (1, 2)]
+    eye, attitude = camera_pose(np.array([0.0, 0.0, -3.0]), np.array([1.0, 0, 0, 0]), SIGHT.mount)
+    k = SIGHT.intrinsics
+    v, u = np.mgrid[: k.height, : k.width]
+    rays = np.stack([np.ones(u.shape), (u - k.cx) / k.focal, (v - k.cy) / k.focal], -1)
+    rays = rays @ quat_to_matrix(np.array(attitude)).T
+    to_middle = np.array([away + CAMERA.forward_m, 0.0, -radius]) - np.array(eye)
+    along = rays @ to_middle / np.linalg.norm(rays, axis=-1)
+    disc = to_middle @ to_middle - along**2 <= radius**2
+    assert shares[0] == shares[1] == pytest.approx(float(disc.mean()), rel=0.05)
 
 
 def test_a_moving_obstacle_is_looked_for_where_it_was() -> None:

@@ -15,11 +15,12 @@ from scipy.spatial import cKDTree
 
 from airl_mav.arena.generate import generate
 from airl_mav.arena.mesh_boxes import MeshBoxes, boxes_of_mesh, joined
+from airl_mav.arena.triangles import standing
 from airl_mav.cli.main import main
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.assets import BoxPart
-from airl_mav.profiles.loading import load_profile
+from airl_mav.profiles.loading import load_profile, profile_digest
 
 SAMPLES = 20_000
 
@@ -159,6 +160,87 @@ def test_joined_boxes_are_exactly_the_cells(bits: int) -> None:
     assert np.array_equal(filled, cells)  # none twice
     if boxes:
         assert joined(cells, len(boxes) - 1) is None
+
+
+def asset(path: Path, out: Path, *words: str) -> ArenaSpec:
+    """Run `airl asset` and return the arena that it wrote."""
+    with pytest.raises(SystemExit) as ended:
+        main(["asset", str(path), "--out", str(out), *words])
+    assert not ended.value.code
+    return load_profile("arenas", str(out), ArenaSpec)
+
+
+def test_cameras_see_the_mesh_in_the_place_of_its_boxes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = export(bracket(), tmp_path / "bracket.stl")
+    seen = asset(path, tmp_path / "seen.toml", "--scale", "0.8")
+    assert "cameras see its 24 triangles" in capsys.readouterr().out
+    boxes = asset(path, tmp_path / "boxes.toml", "--scale", "0.8", "--seen", "boxes")
+    assert "cameras see the boxes" in capsys.readouterr().out
+    assert not (tmp_path / "boxes.npz").exists()
+    arenas = [generate(spec, 3, name="x", vehicle_width_m=0.55) for spec in (seen, boxes)]
+    for field in ("shape", "center", "half_size", "yaw"):
+        first, second = (getattr(arena.obstacles, field) for arena in arenas)
+        np.testing.assert_array_equal(first, second)
+    assert not arenas[1].meshes
+    assert len(arenas[0].meshes) == len(arenas[0].statics.names)  # type: ignore[union-attr]
+    o = arenas[0].obstacles
+    ends = 0
+    for each in arenas[0].meshes:
+        assert each.first == ends
+        ends += each.count
+        # Every corner is in one of the boxes that stand for the mesh.
+        places, _ = standing(each)
+        own = slice(each.first, ends)
+        cos, sin = np.cos(o.yaw[own]), np.sin(o.yaw[own])
+        away = places[:, None] - o.center[own]
+        forward = away[..., 0] * cos + away[..., 1] * sin
+        right = away[..., 1] * cos - away[..., 0] * sin
+        within = np.abs(np.stack([forward, right, away[..., 2]], axis=-1)) <= (
+            o.half_size[own] + 1e-3
+        )
+        assert within.all(axis=-1).any(axis=-1).all()
+    assert ends == len(o)
+
+
+def test_a_mesh_that_has_changed_or_gone_is_told_in_one_line(tmp_path: Path) -> None:
+    path, out = export(bracket(), tmp_path / "bracket.stl"), tmp_path / "brackets.toml"
+    spec = asset(path, out)
+    moved = tmp_path / "elsewhere"
+    moved.mkdir()
+    for name in ("brackets.toml", "brackets.npz"):
+        (moved / name).write_bytes((tmp_path / name).read_bytes())
+    other = load_profile("arenas", str(moved / "brackets.toml"), ArenaSpec)
+    # What an arena is does not depend on where it lies.
+    assert profile_digest(other) == profile_digest(spec)
+    assert other.assets["bracket"].mesh != spec.assets["bracket"].mesh
+    # Nor on meshes, where there are none.
+    assert "mesh" not in asset(path, out, "--seen", "boxes").model_dump_json()
+    data = bytearray((moved / "brackets.npz").read_bytes())
+    data[200] ^= 1
+    (moved / "brackets.npz").write_bytes(bytes(data))
+    with pytest.raises(
+        UsageError, match=r"brackets\.npz: changed since its arena was made"
+    ) as told:
+        load_profile("arenas", str(moved / "brackets.toml"), ArenaSpec)
+    assert "\n" not in str(told.value)
+    (moved / "brackets.npz").unlink()
+    with pytest.raises(UsageError, match=r"brackets\.npz: No such file"):
+        load_profile("arenas", str(moved / "brackets.toml"), ArenaSpec)
+
+
+def test_too_many_triangles_are_refused_unless_boxes_are_seen(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("airl_mav.cli.asset.MOST_TRIANGLES", 23)
+    path = export(bracket(), tmp_path / "bracket.stl")
+    with pytest.raises(SystemExit) as ended:
+        main(["asset", str(path), "--out", str(tmp_path / "x.toml")])
+    assert ended.value.code == 2
+    assert "at most 23 triangles, not 24" in capsys.readouterr().err
+    assert not list(tmp_path.glob("x.*"))
+    assert asset(path, tmp_path / "x.toml", "--seen", "boxes").assets["bracket"].mesh is None
 
 
 def test_what_is_no_mesh_for_an_asset_gets_one_line(tmp_path: Path) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,8 +19,10 @@ from airl_mav.camera.mitsuba import path_traced
 from airl_mav.camera.picture import antialiased, render_picture
 from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import quat_from_euler
+from airl_mav.profiles.appearance import Appearance
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
+from tests.support.meshes import kept, ring, scene_of, triangles
 
 pytest.importorskip("mitsuba")
 
@@ -121,6 +125,24 @@ def test_a_blue_sky_is_theirs() -> None:
     """Radiance from horizon to zenith, and what it makes of plain surfaces."""
     inner, _ = difference(arena("static-obstacles", 7, **PLAIN), (0.0, 0.0, -2.5), 0.2)
     assert inner < 0.03
+
+
+@pytest.mark.parametrize("material", ["plaster", "brick"])
+def test_meshes_are_theirs(material: str, tmp_path: Path) -> None:
+    """Triangles with their shadows, and with bricks as they lie on them."""
+    file = kept(triangles(ring()), tmp_path / "ring.npz")
+    scene = scene_of(file, [(5.0, -1.0, 0.6, 2.0), (7.0, 3.0, -1.0, 1.4), (4.0, 1.5, 2.0, 0.9)])
+    plain = {**LIGHT, **PLAIN, "static": {"materials": [material], "brightness": [0.8, 0.8]}}
+    scene = replace(scene, appearance=Appearance.model_validate(plain))
+    inner, _ = difference(scene, (0.0, 0.0, -2.0), 0.0, rays=4)
+    assert inner < 0.03
+    # Its boxes alone are far off: the limit above can fail.
+    place, attitude = np.array([0.0, 0.0, -2.0]), quat_from_euler(0.03, -0.08, 0.0)
+    centers, boxes = scene.obstacles.center, replace(scene, meshes=())
+    theirs = path_traced(scene, centers, CAMERA, place, attitude, samples=16)
+    ours = antialiased(boxes, centers, CAMERA, place, attitude, 4)
+    shown = render_picture(scene, centers, CAMERA, place, attitude).seen >= 4
+    assert float(np.abs(ours.astype(float) - theirs)[shown].mean()) / 255.0 > 0.1
 
 
 def test_what_it_has_not_is_refused() -> None:

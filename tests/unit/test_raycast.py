@@ -497,6 +497,7 @@ def test_writes_into_the_image_of_a_batch() -> None:
         o.center,
         o.half_size,
         o.yaw,
+        None,
     )
     np.testing.assert_array_equal(batch[1], scene.render())
     assert np.all(batch[[0, 2]] == 7.0)

@@ -483,6 +483,51 @@ def test_the_scene_holds_arena_vehicle_and_trail() -> None:
         server.stop()
 
 
+def test_the_scene_holds_meshes_or_where_their_file_is_gone_their_boxes(tmp_path: Path) -> None:
+    viser = pytest.importorskip("viser")
+    pytest.importorskip("trimesh")
+    from airl_mav.arena.triangles import standing
+    from airl_mav.view.scene import FlightScene
+    from tests.support.meshes import kept, ring, scene_of, triangles
+
+    file = kept(triangles(ring()), tmp_path / "ring.npz")
+    arena = scene_of(file, [(3.0, 2.0, 0.5, 1.5)])
+    gone = file.model_copy(update={"file": str(tmp_path / "gone.npz")})
+    server = viser.ViserServer("127.0.0.1", 0, verbose=False)
+    try:
+        scene, shown = FlightScene(server), Shown()
+        shown.take(episode(arena), None)
+        shown.take(vehicle(0.0), None)
+        scene.draw(shown, picture=False)
+        drawn = server.scene.get_handle_by_name("/flight/arena/mesh/0")
+        places, faces = standing(arena.meshes[0])
+        np.testing.assert_allclose(drawn.vertices, places, atol=1e-5)
+        np.testing.assert_array_equal(drawn.faces, faces)
+        assert server.scene.get_handle_by_name("/flight/arena/obstacle/0") is None
+        lost = replace(arena, meshes=(replace(arena.meshes[0], file=gone),))
+        shown.take(episode(lost), None)
+        scene.draw(shown, picture=False)
+        assert server.scene.get_handle_by_name("/flight/arena/mesh/0") is None
+        assert server.scene.get_handle_by_name("/flight/arena/obstacle/0") is not None
+    finally:
+        server.stop()
+
+
+def test_meshes_are_told_by_their_file(tmp_path: Path) -> None:
+    pytest.importorskip("trimesh")
+    from tests.support.meshes import kept, ring, scene_of, triangles
+
+    file = kept(triangles(ring()), tmp_path / "ring.npz")
+    arena = scene_of(file, [(3.0, 2.0, 0.5, 1.5), (-1.0, 4.0, -2.0, 1.0)])
+    parts = to_parts(episode(arena))
+    assert sum(map(len, parts)) < 4000
+    read = from_parts(parts)
+    assert read is not None
+    assert isinstance(read[0], Episode)
+    assert read[0].arena is not None
+    assert read[0].arena.arena().meshes == arena.meshes
+
+
 def test_walls_are_seen_from_inside() -> None:
     pytest.importorskip("viser")
     from airl_mav.view.scene import walls

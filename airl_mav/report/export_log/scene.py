@@ -22,10 +22,12 @@ from foxglove.messages import (
     SpherePrimitive,
     TextPrimitive,
     Timestamp,
+    TriangleListPrimitive,
     Vector3,
 )
 
-from airl_mav.arena.geometry import Arena, Bounds, Shape
+from airl_mav.arena.geometry import Arena, Bounds, PlacedMesh, Shape
+from airl_mav.arena.triangles import drawn, standing
 from airl_mav.core.frames import frd_to_flu, ned_to_enu, quat_from_direction, quat_from_euler
 from airl_mav.profiles.vehicle import CORNERS
 from airl_mav.report.export_log.foxglove_types import (
@@ -78,11 +80,13 @@ def arena_scene(
             timestamp=at, frame_id=WORLD, id="walls", cubes=_walls(bounds, arena.wall_colour)
         )
         centers = arena.obstacles.center
-        standing = [
+        shown = drawn(arena.meshes)
+        still = [
             obstacle(arena, i, centers[i], STILL, f"obstacle/{i}", at)
             for i in range(arena.n_static)
+            if arena.mesh_of(i) not in shown
         ]
-        entities += [walls, *standing]
+        entities += [walls, *still, *(_mesh(each, at) for each in shown)]
     return SceneUpdate(entities=entities)
 
 
@@ -172,6 +176,19 @@ def obstacle(
         return SceneEntity(**entity, spheres=[SpherePrimitive(**look)])
     whole = CylinderPrimitive(**look, bottom_scale=1.0, top_scale=1.0)
     return SceneEntity(**entity, cylinders=[whole])
+
+
+def _mesh(placed: PlacedMesh, at: Timestamp) -> SceneEntity:
+    """Return a mesh where it stands."""
+    places, faces = standing(placed)
+    surface = TriangleListPrimitive(
+        pose=Pose(position=vector(np.zeros(3)), orientation=quaternion(UNTURNED)),
+        points=points(places),
+        color=colour(STILL),
+        indices=faces.ravel().tolist(),
+    )
+    name = f"mesh/{placed.first}"
+    return SceneEntity(timestamp=at, frame_id=WORLD, id=name, triangles=[surface])
 
 
 def _floor(b: Bounds) -> CubePrimitive:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.geometry import Arena, Obstacles, Shape
+from airl_mav.arena.geometry import Arena, Obstacles, PlacedMesh, Shape
 from airl_mav.camera.colour import RANGE_M
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import Mount, camera_pose, render
@@ -141,14 +141,19 @@ def view_obstacle(
     offset = spot + (centers[i] - centers_then[i])[:2] - position[:2]
     eye, attitude = camera_pose(position, quaternion, camera.mount)
 
-    def depth(keep: slice) -> NDArray[np.float32]:
+    def depth(keep: slice, meshes: tuple[PlacedMesh, ...]) -> NDArray[np.float32]:
         """Return the depth image (h, w) of the arena with some of its obstacles only."""
         o = arena.obstacles
         some = Obstacles(o.shape[keep], o.center[keep], o.half_size[keep], o.yaw[keep])
-        bare = replace(arena, obstacles=some, tours=())
+        bare = replace(arena, obstacles=some, tours=(), meshes=meshes)
         return render(bare, centers[keep], camera.intrinsics, camera.range_m, eye, attitude)
 
-    whole, alone, empty = depth(slice(None)), depth(slice(i, i + 1)), depth(slice(0, 0))
+    whole, empty = depth(slice(None), arena.meshes), depth(slice(0, 0), ())
+    if (mesh := arena.mesh_of(i)) is None:
+        alone = depth(slice(i, i + 1), ())
+    else:
+        owned = slice(mesh.first, mesh.first + mesh.count)
+        alone = depth(owned, (replace(mesh, first=0),))
     outline = np.abs(alone - empty) > SAME_DEPTH_M
     shown = outline & (np.abs(whole - alone) <= SAME_DEPTH_M)
     return ObstacleView(

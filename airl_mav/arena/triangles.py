@@ -1,0 +1,137 @@
+"""The triangles of a mesh that cameras see, in a file beside the arena's profile.
+
+A NumPy archive (.npz) without pickled objects holds two arrays: `vertices` (n, 3) float32, forward,
+right and down from the asset's place on the floor [m], and `faces` (m, 3) int32, the corners of the
+triangles. The profile says the file's SHA-256.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import zipfile
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.arena.geometry import PlacedMesh
+from airl_mav.core.errors import UsageError
+from airl_mav.profiles.mesh_file import GREATEST_M, MOST_TRIANGLES, MeshFile, read_checked
+
+KEPT = 16
+"""Meshes that a process keeps in memory."""
+
+MOST_DRAWN = 100_000
+"""Triangles of one scene in a browser."""
+
+
+@dataclass(frozen=True, eq=False)
+class Triangles:
+    """m triangles. Two of them are the same where they are one object: they are large."""
+
+    vertices: NDArray[np.float32]  # (n, 3) forward, right, down [m]
+    faces: NDArray[np.int32]  # (m, 3) numbers of vertices
+
+    def __len__(self) -> int:
+        """Return m."""
+        return len(self.faces)
+
+    @property
+    def corners(self) -> NDArray[np.float32]:
+        """The corners (m, 3, 3) of each triangle [m]."""
+        return self.vertices[self.faces]
+
+
+@lru_cache(maxsize=KEPT)
+def triangles_of(file: MeshFile) -> Triangles:
+    """Return the triangles of a file, read once in a process.
+
+    Raises:
+        UsageError: It cannot be read, is not the file that the profile was made with, or holds
+            anything but triangles.
+    """
+    return decoded(read_checked(file), file.file)
+
+
+def standing(placed: PlacedMesh) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    """Return the vertices (n, 3) NED [m] of a mesh where it stands, and its faces (m, 3).
+
+    Raises:
+        UsageError: As `triangles_of`.
+    """
+    held = triangles_of(placed.file)
+    cos, sin = math.cos(placed.yaw), math.sin(placed.yaw)
+    turn = placed.scale * np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    places: NDArray[np.float64] = held.vertices @ turn + [*placed.place, 0.0]
+    return places, held.faces
+
+
+def drawn(meshes: Iterable[PlacedMesh], most: int = MOST_DRAWN) -> list[PlacedMesh]:
+    """Return the meshes, of so many triangles at most, that a scene for people shows as they are.
+
+    The others are shown as boxes. Those are too much for a browser, or their file is not there:
+    pictures of old flights are looked at without it.
+    """
+    shown: list[PlacedMesh] = []
+    left = most
+    for each in meshes:
+        try:
+            count = len(triangles_of(each.file))
+        except UsageError:
+            continue
+        if count <= left:
+            left -= count
+            shown.append(each)
+    return shown
+
+
+def encoded(triangles: Triangles) -> bytes:
+    """Return the file of triangles: the same triangles, the same bytes."""
+    held = io.BytesIO()
+    np.savez(held, vertices=triangles.vertices, faces=triangles.faces)
+    return held.getvalue()
+
+
+def decoded(data: bytes, source: str) -> Triangles:
+    """Return the triangles that a file holds; `source` is what messages call it.
+
+    Raises:
+        UsageError: It holds anything but triangles of an asset.
+    """
+    try:
+        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+            vertices, faces = archive["vertices"], archive["faces"]
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        told = " ".join(f"{error}".split())
+        raise UsageError(f"{source}: not the triangles of a mesh: {told}") from None
+    if (problem := _problem(vertices, faces)) is not None:
+        raise UsageError(f"{source}: {problem}")
+    for each in (vertices, faces):
+        each.setflags(write=False)
+    return Triangles(vertices, faces)
+
+
+def _problem(vertices: NDArray[np.float32], faces: NDArray[np.int32]) -> str | None:
+    """Return what is wrong with the arrays of a file; None: nothing."""
+    for name, array, kind in (("vertices", vertices, np.float32), ("faces", faces, np.int32)):
+        if array.dtype != kind or array.ndim != 2 or array.shape[1] != 3:
+            return f"{name} {array.dtype} {array.shape}: accepted: {np.dtype(kind)} (n, 3)"
+    if not 1 <= len(faces) <= MOST_TRIANGLES:
+        return f"{len(faces):,} triangles: accepted: 1 to {MOST_TRIANGLES:,}"
+    if int(faces.min()) < 0 or int(faces.max()) >= len(vertices):
+        return f"faces: accepted: numbers of its {len(vertices):,} vertices"
+    if not (np.abs(vertices) <= GREATEST_M).all():  # NaN is not, either
+        return f"vertices: accepted: places within {GREATEST_M:g} m of the asset's"
+    if not areas(vertices[faces]).any():
+        return "faces: accepted: triangles, at least one of which has an area"
+    return None
+
+
+def areas(corners: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Return twice the area (m,) [m²] of triangles by their corners (m, 3, 3) [m]."""
+    sides = np.diff(corners.astype(np.float64), axis=1)
+    twice: NDArray[np.float64] = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+    return twice

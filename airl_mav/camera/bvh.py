@@ -1,0 +1,290 @@
+"""A bounding volume hierarchy over the triangles of a mesh, built once for each mesh.
+
+A binary tree of boxes along the mesh's axes (Wald, On fast construction of SAH-based bounding
+volume hierarchies, 2007): each split is the one of least expected cost of a ray, by the surface
+areas of both sides, among `BINS` places along each axis. The tree lies in flat arrays, depth first:
+the left child of an inner node is the next node.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.arena.geometry import PlacedMesh
+from airl_mav.arena.triangles import KEPT, Triangles, triangles_of
+from airl_mav.core.kernels import kernel, large_kernel
+from airl_mav.profiles.mesh_file import MeshFile
+
+BINS: Final = 16
+"""Places of splits along an axis."""
+
+LEAF: Final = 4
+"""A leaf has at most so many triangles."""
+
+DEEPEST: Final = 32
+"""Below this level nodes are split in halves, so that no tree is deeper than twice as much."""
+
+SPARE_M: Final = 1e-6
+"""A node is larger than its triangles by this, to each side [m]."""
+
+STACK: Final = 2 * DEEPEST
+"""Nodes that wait while a tree is walked through, at most."""
+
+
+class Bvh(NamedTuple):
+    """Trees over the triangles of meshes, one after the other; a tuple, so that kernels take it."""
+
+    boxes: NDArray[np.float32]  # (k, 6) centre and half size of each node along the axes [m]
+    links: NDArray[np.int32]
+    """(k, 2) of an inner node: its right child, 0. Of a leaf: its first triangle, their number."""
+    corners: NDArray[np.float32]  # (m, 9) three corners of each triangle, in the leaves' order [m]
+    normals: NDArray[np.float32]  # (m, 3) unit vectors, to either side
+
+
+def build_bvh(triangles: Triangles) -> Bvh:
+    """Return the tree over triangles: a pure function of them.
+
+    Triangles without an area are left out: no ray hits them.
+    """
+    corners = triangles.corners.astype(np.float64)
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(across, axis=1)
+    keep = area > 0.0
+    corners, normals = corners[keep], across[keep] / area[keep, None]
+    low, high = corners.min(axis=1), corners.max(axis=1)
+    m = len(corners)
+    order = np.arange(m, dtype=np.int32)
+    room = max(2 * m - 1, 1)
+    bounds, links = np.zeros((room, 6)), np.zeros((room, 2), np.int32)
+    count = _build(low, high, order, bounds, links)
+    bounds, links = bounds[:count], links[:count].copy()
+    centre = (0.5 * (bounds[:, :3] + bounds[:, 3:])).astype(np.float32)
+    reach = np.maximum(bounds[:, 3:] - centre, centre - bounds[:, :3])
+    # Neither in float32 nor to a ray that is rounded a node is smaller than what is in it.
+    half = np.nextafter((reach + SPARE_M).astype(np.float32), np.float32(np.inf))
+    return Bvh(
+        np.concatenate([centre, half], axis=1),
+        links,
+        corners[order].reshape(m, 9).astype(np.float32),
+        normals[order].astype(np.float32),
+    )
+
+
+@large_kernel
+def _build(
+    low: NDArray[np.float64],
+    high: NDArray[np.float64],
+    order: NDArray[np.int32],
+    bounds: NDArray[np.float64],
+    links: NDArray[np.int32],
+) -> int:
+    """Write the tree over m boxes; return its number of nodes.
+
+    Args:
+        low: (m, 3) lowest corners of the boxes.
+        high: (m, 3) highest.
+        order: (m,) their numbers, changed into the order of the leaves.
+        bounds: (2 m - 1, 6) written: lowest and highest corner of each node.
+        links: (2 m - 1, 2) written, as of `Bvh`.
+    """
+    waiting = np.empty((STACK + 1, 4), np.int64)  # begin, end, parent of a right child, level
+    waiting[0] = (0, len(order), -1, 0)
+    tops, count = 1, 0
+    from_low, from_high = np.empty(3), np.empty(3)  # of the centres
+    while tops > 0:
+        tops -= 1
+        begin, end, parent, level = waiting[tops]
+        node = count
+        count += 1
+        if parent >= 0:
+            links[parent, 0] = node
+        bounds[node, :3], bounds[node, 3:] = math.inf, -math.inf
+        from_low[:], from_high[:] = math.inf, -math.inf
+        for k in range(begin, end):
+            i = order[k]
+            for axis in range(3):
+                a, b = low[i, axis], high[i, axis]
+                bounds[node, axis] = min(bounds[node, axis], a)
+                bounds[node, 3 + axis] = max(bounds[node, 3 + axis], b)
+                from_low[axis] = min(from_low[axis], a + b)
+                from_high[axis] = max(from_high[axis], a + b)
+        if end - begin <= LEAF:
+            links[node, 0], links[node, 1] = begin, end - begin
+            continue
+        axis, place = -1, 0
+        if level < DEEPEST:
+            axis, place = _best_split(low, high, order, begin, end, from_low, from_high)
+        middle = (begin + end) // 2
+        if axis >= 0:
+            per = BINS / (from_high[axis] - from_low[axis])
+            first, last = begin, end - 1
+            while first <= last:
+                i = order[first]
+                at = min(int((low[i, axis] + high[i, axis] - from_low[axis]) * per), BINS - 1)
+                if at <= place:
+                    first += 1
+                else:
+                    order[first], order[last] = order[last], i
+                    last -= 1
+            middle = first
+        waiting[tops] = (middle, end, node, level + 1)
+        waiting[tops + 1] = (begin, middle, -1, level + 1)
+        tops += 2
+    return count
+
+
+@large_kernel
+def _best_split(
+    low: NDArray[np.float64],
+    high: NDArray[np.float64],
+    order: NDArray[np.int32],
+    begin: int,
+    end: int,
+    from_low: NDArray[np.float64],
+    from_high: NDArray[np.float64],
+) -> tuple[int, int]:
+    """Return the axis, and the last bin on the left, of the split of least cost; -1: there is none.
+
+    Args:
+        low: As of `_build`, with the next two.
+        high: Highest corners.
+        order: Numbers of the boxes.
+        begin: First of the boxes that are split.
+        end: One after the last.
+        from_low: (3,) twice the least of their centres.
+        from_high: (3,) twice the greatest.
+    """
+    filled = np.empty(BINS, np.int64)
+    bin_low, bin_high = np.empty((BINS, 3)), np.empty((BINS, 3))
+    right_area = np.empty(BINS)
+    side_low, side_high = np.empty(3), np.empty(3)
+    best, best_axis, best_bin = math.inf, -1, 0
+    for axis in range(3):
+        extent = from_high[axis] - from_low[axis]
+        if not extent > 0.0:
+            continue
+        per = BINS / extent
+        filled[:] = 0
+        bin_low[:, :], bin_high[:, :] = math.inf, -math.inf
+        for k in range(begin, end):
+            i = order[k]
+            at = min(int((low[i, axis] + high[i, axis] - from_low[axis]) * per), BINS - 1)
+            filled[at] += 1
+            for each in range(3):
+                bin_low[at, each] = min(bin_low[at, each], low[i, each])
+                bin_high[at, each] = max(bin_high[at, each], high[i, each])
+        side_low[:], side_high[:] = math.inf, -math.inf
+        number = 0
+        for at in range(BINS - 1, 0, -1):
+            number += filled[at]
+            right_area[at] = number * _grown_area(side_low, side_high, bin_low, bin_high, at)
+        side_low[:], side_high[:] = math.inf, -math.inf
+        number = 0
+        for at in range(BINS - 1):
+            number += filled[at]
+            cost = number * _grown_area(side_low, side_high, bin_low, bin_high, at)
+            cost += right_area[at + 1]
+            if number > 0 and number < end - begin and cost < best:
+                best, best_axis, best_bin = cost, axis, at
+    return best_axis, best_bin
+
+
+@large_kernel
+def _grown_area(
+    side_low: NDArray[np.float64],
+    side_high: NDArray[np.float64],
+    bin_low: NDArray[np.float64],
+    bin_high: NDArray[np.float64],
+    at: int,
+) -> float:
+    """Put a bin into a side; return half the surface of its box, 0 where it holds nothing."""
+    for each in range(3):
+        side_low[each] = min(side_low[each], bin_low[at, each])
+        side_high[each] = max(side_high[each], bin_high[at, each])
+    a, b, c = side_high[0] - side_low[0], side_high[1] - side_low[1], side_high[2] - side_low[2]
+    return a * b + b * c + c * a if a >= 0.0 else 0.0
+
+
+@lru_cache(maxsize=KEPT)
+def bvh_of(file: MeshFile) -> Bvh:
+    """Return the tree of a file's triangles. Raises UsageError as `triangles_of`."""
+    return build_bvh(triangles_of(file))
+
+
+class Forest(NamedTuple):
+    """The trees of several meshes, and where each begins."""
+
+    bvh: Bvh
+    roots: dict[MeshFile, int]
+
+
+@lru_cache(maxsize=4)
+def forest_of(files: tuple[MeshFile, ...]) -> Forest:
+    """Return the trees of meshes in one. Raises UsageError as `triangles_of`."""
+    trees = [bvh_of(file) for file in files]
+    if len(trees) == 1:
+        return Forest(trees[0], {files[0]: 0})
+    nodes = np.cumsum([0, *(len(tree.boxes) for tree in trees)])
+    faces = np.cumsum([0, *(len(tree.corners) for tree in trees)])
+    links = []
+    for tree, node, face in zip(trees, nodes, faces, strict=False):
+        moved = tree.links.copy()
+        moved[:, 0] += np.where(moved[:, 1] > 0, face, node).astype(np.int32)
+        links.append(moved)
+    bvh = Bvh(
+        np.concatenate([tree.boxes for tree in trees]),
+        np.concatenate(links),
+        np.concatenate([tree.corners for tree in trees]),
+        np.concatenate([tree.normals for tree in trees]),
+    )
+    return Forest(bvh, dict(zip(files, nodes.tolist(), strict=False)))
+
+
+class Meshes(NamedTuple):
+    """The meshes of an arena as kernels take them: k that stand somewhere."""
+
+    bvh: Bvh
+    owner: NDArray[np.int32]  # (n,) the mesh that each obstacle is a part of, -1: of none
+    first: NDArray[np.int32]  # (k,) the obstacle whose number and material it has
+    root: NDArray[np.int32]  # (k,) root of its tree
+    pose: NDArray[np.float64]  # (k, 5) north, east [m], cosine and sine of its heading, scale
+
+
+@kernel
+def is_owned(meshes: Meshes | None, i: int) -> bool:
+    """Return whether cameras see a mesh in place of obstacle i."""
+    return False if meshes is None else meshes.owner[i] >= 0
+
+
+def meshes_of(placed: tuple[PlacedMesh, ...], n_obstacles: int) -> Meshes | None:
+    """Return the meshes of an arena; None: it has none.
+
+    Raises:
+        UsageError: The file of one cannot be read, or is another one.
+    """
+    if not placed:
+        return None
+    forest = forest_of(tuple(dict.fromkeys(each.file for each in placed)))
+    return Meshes(forest.bvh, *placed_in(forest, placed, n_obstacles))
+
+
+def placed_in(
+    forest: Forest, placed: tuple[PlacedMesh, ...], n_obstacles: int
+) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32], NDArray[np.float64]]:
+    """Return `owner`, `first`, `root` and `pose` of `Meshes`."""
+    owner = np.full(n_obstacles, -1, np.int32)
+    for k, each in enumerate(placed):
+        owner[each.first : each.first + each.count] = k
+    return (
+        owner,
+        np.array([each.first for each in placed], np.int32),
+        np.array([forest.roots[each.file] for each in placed], np.int32),
+        np.array(
+            [(*each.place, math.cos(each.yaw), math.sin(each.yaw), each.scale) for each in placed]
+        ).reshape(len(placed), 5),
+    )

@@ -1,0 +1,235 @@
+"""Which of an image's points a mesh hides from the sun: rays through its tree.
+
+The rays of all points have one direction. Where a mesh is seen itself, those begin a little above
+its surface, on the side that is seen, and none are cast where that faces away from the sun.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.camera.bvh import STACK, Bvh, Meshes
+from airl_mav.camera.meshes import Faces, inverse_of, seen_from
+from airl_mav.camera.primitives import OBSTACLE, SKY, Ids, Line, Lines
+from airl_mav.camera.projection import Pose, View, dot
+from airl_mav.camera.shading import F32, ZERO, Plane
+from airl_mav.camera.shadows import shadow_rectangle, start32, widened
+from airl_mav.core.kernels import kernel, large_kernel
+from airl_mav.vehicle.rotation import Vec
+
+_ABOVE_M: Final = 5e-4
+"""So far above the surface that is seen, and no nearer to its own, a ray begins [m]."""
+
+_WIDER_M: Final = 1e-4
+"""The box around a mesh is so much larger, where what is worked out is rounded to float32 [m]."""
+
+
+@large_kernel
+def shade_by_meshes(
+    lit: Plane,
+    far: Plane,
+    ids: Ids,
+    faces: Faces,
+    corners: NDArray[np.float64],
+    lines: Lines,
+    xs: Line,
+    view: View,
+    axes: Pose,
+    camera: Vec,
+    meshes: Meshes,
+    to_sun: Vec,
+) -> None:
+    """Put the points that meshes hide from the sun into shadow.
+
+    Args:
+        lit: (n, m) changed: 0 in shadow.
+        far: (n, m) depth [m].
+        ids: (n, m) what is seen.
+        faces: (n, m) which of its triangles, where a mesh is seen.
+        corners: (CORNERS, 3) room to work in.
+        lines: Of the image.
+        xs: Rays of a line.
+        view: How the image sees.
+        axes: The camera's axes.
+        camera: (3,) NED [m].
+        meshes: Those of the arena.
+        to_sun: (3,) unit vector NED.
+    """
+    waiting = np.empty(STACK, np.int32)
+    for k in range(len(meshes.root)):
+        _shade_by_mesh(
+            lit, far, ids, faces, corners, lines, xs, view, axes, camera, meshes, k, to_sun, waiting
+        )
+
+
+@large_kernel
+def _shade_by_mesh(
+    lit: Plane,
+    far: Plane,
+    ids: Ids,
+    faces: Faces,
+    corners: NDArray[np.float64],
+    lines: Lines,
+    xs: Line,
+    view: View,
+    axes: Pose,
+    camera: Vec,
+    meshes: Meshes,
+    k: int,
+    to_sun: Vec,
+    waiting: NDArray[np.int32],
+) -> None:
+    """Put the points that mesh k hides into shadow."""
+    bvh, root, scale = meshes.bvh, meshes.root[k], meshes.pose[k, 4]
+    cos, sin = meshes.pose[k, 2], meshes.pose[k, 3]
+    pose = seen_from(axes, camera, meshes.pose, k)
+    sun = (cos * to_sun[0] + sin * to_sun[1], cos * to_sun[1] - sin * to_sun[0], to_sun[2])
+    box = bvh.boxes[root]
+    half = (float(box[3]), float(box[4]), float(box[5]))
+    c = pose.center
+    middle = (c[0] + box[0], c[1] + box[1], c[2] + box[2])
+    top, bottom, left, end = 0, len(lines), 0, len(xs)
+    per = 1.0 / scale
+    if not view.cylindrical:
+        # In units of the mesh, as all that follows.
+        floor = -(middle[2] + per * camera[2])
+        around = Pose(pose.forward, pose.across, pose.along, middle)
+        top, bottom, left, end = shadow_rectangle(
+            corners, len(lines), len(xs), view, around, half, sun, floor
+        )
+    if top >= bottom or left >= end:
+        return
+    left, end = widened(left, end, 0, len(xs))
+    inverse = (inverse_of(sun[0]), inverse_of(sun[1]), inverse_of(sun[2]))
+    own = np.int32(OBSTACLE + meshes.first[k])
+    f, d, r = pose.forward, pose.across, pose.along
+    above, last = per * _ABOVE_M, -1
+    # First which points may be hidden, in float32 and so many at a time.
+    c0, c1, c2 = F32(middle[0]), F32(middle[1]), F32(middle[2])
+    r0, r1, r2, per32 = F32(r[0]), F32(r[1]), F32(r[2]), F32(per)
+    i0, i1, i2 = F32(inverse[0]), F32(inverse[1]), F32(inverse[2])
+    wide = per * _WIDER_M
+    w0, w1, w2 = (
+        F32((half[0] + wide) * abs(inverse[0])),
+        F32((half[1] + wide) * abs(inverse[1])),
+        F32((half[2] + wide) * abs(inverse[2])),
+    )
+    maybe = np.empty(len(xs), np.bool_)
+    for v in range(top, bottom):
+        d0, d1, d2 = start32(pose, lines[v, 0], lines[v, 1])
+        far_row, ids_row, lit_row = far[v, left:end], ids[v, left:end], lit[v, left:end]
+        x_row = xs[left:end]
+        for u in range(end - left):
+            x, t = F32(x_row[u]), per32 * far_row[u]
+            a = (c0 - t * (d0 + x * r0)) * i0
+            b = (c1 - t * (d1 + x * r1)) * i1
+            e = (c2 - t * (d2 + x * r2)) * i2
+            enter = max(max(a - w0, b - w1), e - w2)
+            leave = min(min(a + w0, b + w1), e + w2)
+            reached = (leave >= max(enter, ZERO)) & (ids_row[u] != SKY)
+            maybe[u] = reached & (lit_row[u] > ZERO)
+        for u in range(end - left):
+            if not maybe[u]:
+                continue
+            x, t = x_row[u], per * far_row[u]
+            ahead, y = lines[v, 0], lines[v, 1]
+            ray = (
+                ahead * f[0] + y * d[0] + x * r[0],
+                ahead * f[1] + y * d[1] + x * r[1],
+                ahead * f[2] + y * d[2] + x * r[2],
+            )
+            # From the mesh's origin.
+            at = (t * ray[0] - c[0], t * ray[1] - c[1], t * ray[2] - c[2])
+            if ids_row[u] == own:
+                i = faces[v, left + u]
+                normal = (bvh.normals[i, 0], bvh.normals[i, 1], bvh.normals[i, 2])
+                side = -above if dot(normal, ray) > 0.0 else above
+                if side * dot(normal, sun) <= 0.0:
+                    continue
+                at = (at[0] + side * normal[0], at[1] + side * normal[1], at[2] + side * normal[2])
+            last = _hit(bvh, root, at, sun, inverse, above, last, waiting)
+            if last >= 0:
+                lit_row[u] = ZERO
+
+
+@kernel
+def _hit(
+    bvh: Bvh,
+    root: int,
+    at: Vec,
+    sun: Vec,
+    inverse: Vec,
+    least: float,
+    last: int,
+    waiting: NDArray[np.int32],
+) -> int:
+    """Return a triangle between a point and the sun, -1: there is none.
+
+    Args:
+        bvh: The trees.
+        root: The mesh's.
+        at: (3,) the point, from the mesh's origin, with all else in units of the mesh.
+        sun: (3,) unit vector.
+        inverse: (3,) one over each of its components.
+        least: Triangles nearer than this do not count.
+        last: One that hid the point before: it is likely to hide this one.
+        waiting: (STACK,) room to work in.
+    """
+    if last >= 0 and _stops(bvh.corners, last, at, sun, least):
+        return last
+    i0, i1, i2 = inverse
+    v0, v1, v2 = abs(i0), abs(i1), abs(i2)
+    boxes, links = bvh.boxes, bvh.links
+    tops, node = 0, root
+    while True:
+        a, b, c = (
+            (boxes[node, 0] - at[0]) * i0,
+            (boxes[node, 1] - at[1]) * i1,
+            (boxes[node, 2] - at[2]) * i2,
+        )
+        w0, w1, w2 = boxes[node, 3] * v0, boxes[node, 4] * v1, boxes[node, 5] * v2
+        enter = max(max(a - w0, b - w1), c - w2)
+        leave = min(min(a + w0, b + w1), c + w2)
+        if leave >= max(enter, least):
+            count = links[node, 1]
+            if count == 0:
+                waiting[tops] = links[node, 0]
+                tops += 1
+                node += 1
+                continue
+            first = links[node, 0]
+            for i in range(first, first + count):
+                if _stops(bvh.corners, i, at, sun, least):
+                    return i
+        if tops == 0:
+            return -1
+        tops -= 1
+        node = waiting[tops]
+
+
+@kernel
+def _stops(corners: NDArray[np.float32], i: int, at: Vec, way: Vec, least: float) -> bool:
+    """Return whether a ray hits a triangle, from either side, no nearer than `least`.
+
+    Moller and Trumbore, Fast, minimum storage ray-triangle intersection, 1997.
+    """
+    p0, p1, p2 = float(corners[i, 0]), float(corners[i, 1]), float(corners[i, 2])
+    a0, a1, a2 = corners[i, 3] - p0, corners[i, 4] - p1, corners[i, 5] - p2
+    b0, b1, b2 = corners[i, 6] - p0, corners[i, 7] - p1, corners[i, 8] - p2
+    h0, h1, h2 = way[1] * b2 - way[2] * b1, way[2] * b0 - way[0] * b2, way[0] * b1 - way[1] * b0
+    volume = a0 * h0 + a1 * h1 + a2 * h2
+    if volume == 0.0:
+        return False
+    per = 1.0 / volume
+    s0, s1, s2 = at[0] - p0, at[1] - p1, at[2] - p2
+    u = per * (s0 * h0 + s1 * h1 + s2 * h2)
+    if u < 0.0 or u > 1.0:
+        return False
+    q0, q1, q2 = s1 * a2 - s2 * a1, s2 * a0 - s0 * a2, s0 * a1 - s1 * a0
+    v = per * (way[0] * q0 + way[1] * q1 + way[2] * q2)
+    if v < 0.0 or u + v > 1.0:
+        return False
+    return bool(per * (b0 * q0 + b1 * q1 + b2 * q2) >= least)

@@ -1,0 +1,154 @@
+"""Meshes in colour, where the image sees them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.arena.appearance import OBSTACLE as OBSTACLE_ROW
+from airl_mav.camera.bvh import Meshes
+from airl_mav.camera.meshes import Faces
+from airl_mav.camera.primitives import OBSTACLE, Ids, Line, Lines, Rectangles, turned
+from airl_mav.camera.projection import Pose
+from airl_mav.camera.shading import (
+    F32,
+    I32,
+    ONE,
+    ZERO,
+    Lit,
+    Packed,
+    Plane,
+    Points,
+    Surface,
+    paint,
+    surface_of,
+    texel_at,
+)
+from airl_mav.camera.shadows import start32
+from airl_mav.camera.surfaces import STEEP, span_of, texels2
+from airl_mav.core.kernels import large_kernel
+from airl_mav.vehicle.rotation import Vec
+
+
+@large_kernel
+def shade_meshes(
+    out: Packed,
+    ids: Ids,
+    far: Plane,
+    lit: Plane,
+    clear: Plane,
+    points: Points,
+    rectangles: Rectangles,
+    meshes: Meshes,
+    faces: Faces,
+    lines: Lines,
+    xs: Line,
+    axes: Pose,
+    camera: Vec,
+    texture: NDArray[np.int8],
+    per_m: NDArray[np.float32],
+    offset: NDArray[np.float32],
+    albedo: NDArray[np.float32],
+    light: Lit,
+    atlas: Plane,
+    pixel2: np.float32,
+) -> None:
+    """Shade what is seen of the meshes of an arena.
+
+    Each triangle is flat. The pattern lies on it as seen along that axis of the mesh that its
+    normal is nearest to, and begins in the mesh's origin.
+
+    Args:
+        out: (n,) packed colours, written.
+        ids: (n,) what is seen.
+        far: (n,) depth [m].
+        lit: (n,) 1 in the sun, 0 in shadow.
+        clear: (n,) share of light that the fog lets through.
+        points: Room to work in.
+        rectangles: (obstacles, 3, 4) of each mesh's first obstacle the pixels, in its first place.
+        meshes: Those of the arena.
+        faces: (n,) which of its triangles is seen.
+        lines: Of the image.
+        xs: Rays of a line.
+        axes: The camera's axes.
+        camera: (3,) NED [m].
+        texture: As of `colour.render_colour`, with the next three.
+        per_m: Periods of the pattern for a metre.
+        offset: Where it begins.
+        albedo: Of both its ends.
+        light: The light.
+        atlas: `textures.atlas()`.
+        pixel2: Square of the side of a pixel at a depth of 1.
+    """
+    for k in range(len(meshes.first)):
+        i = meshes.first[k]
+        surface = surface_of(texture, per_m, offset, albedo, OBSTACLE_ROW + i)
+        _shade_mesh(
+            out, ids, far, lit, clear, points, rectangles[i, 0], meshes, k, faces, lines, xs, axes,
+            camera, surface, light, atlas, pixel2,
+        )  # fmt: skip
+
+
+@large_kernel
+def _shade_mesh(
+    out: Packed,
+    ids: Ids,
+    far: Plane,
+    lit: Plane,
+    clear: Plane,
+    points: Points,
+    rectangle: NDArray[np.int32],
+    meshes: Meshes,
+    k: int,
+    faces: Faces,
+    lines: Lines,
+    xs: Line,
+    axes: Pose,
+    camera: Vec,
+    surface: Surface,
+    light: Lit,
+    atlas: Plane,
+    pixel2: np.float32,
+) -> None:
+    """Shade what is seen of mesh k in a rectangle (4,) of the image."""
+    cos, sin = meshes.pose[k, 2], meshes.pose[k, 3]
+    offset = (meshes.pose[k, 0] - camera[0], meshes.pose[k, 1] - camera[1], -camera[2])
+    pose = turned(Pose(axes.forward, axes.across, axes.along, offset), cos, sin)
+    c0, c1, c2 = F32(pose.center[0]), F32(pose.center[1]), F32(pose.center[2])
+    r0, r1, r2 = F32(pose.along[0]), F32(pose.along[1]), F32(pose.along[2])
+    s0 = F32(cos * light.to_sun[0] + sin * light.to_sun[1])
+    s1 = F32(cos * light.to_sun[1] - sin * light.to_sun[0])
+    s2 = light.to_sun[2]
+    texel, per_m = texels2(surface, pixel2), surface.per_m
+    begin_u, begin_v = surface.offset[0], surface.offset[1]
+    normals = meshes.bvh.normals
+    own = I32(OBSTACLE + meshes.first[k])
+    for v in range(rectangle[0], rectangle[1]):
+        line = v * len(xs)
+        low, high = line + rectangle[2], line + rectangle[3]
+        left, end = span_of(ids, line, line + len(xs), low, high, own, own)
+        if end == 0:
+            continue
+        d0, d1, d2 = start32(pose, lines[v, 0], lines[v, 1])
+        for at in range(left, end):
+            u = at - left
+            if ids[at] != own:
+                # It is not painted; its place must only be one of the pattern.
+                points.place[u] = I32(1)
+                continue
+            x, t, i = F32(xs[at - line]), far[at], faces[at]
+            n, e, d = d0 + x * r0, d1 + x * r1, d2 + x * r2
+            n0, n1, n2 = normals[i, 0], normals[i, 1], normals[i, 2]
+            normal = n0 * n + n1 * e + n2 * d
+            # The side that is seen faces the camera.
+            side = -ONE if normal > ZERO else ONE
+            a, b, c = t * n - c0, t * e - c1, t * d - c2
+            q0, q1, q2 = abs(n0), abs(n1), abs(n2)
+            level = q2 >= max(q0, q1)
+            across = a if level or q1 > q0 else b
+            along = b if level else c
+            texels = texel * t * t / max(abs(normal), STEEP)
+            points.place[u] = texel_at(across * per_m + begin_u, along * per_m + begin_v, texels)
+            points.facing[u] = max(side * (n0 * s0 + n1 * s1 + n2 * s2), ZERO)
+            points.up[u] = -side * n2
+        paint(out, ids, lit, clear, left, end, own, own, points, surface, light, atlas)

@@ -1,0 +1,70 @@
+"""The file of a mesh that cameras see in place of an asset's parts, and whether it has changed."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+from pydantic import (
+    Field,
+    SerializationInfo,
+    SerializerFunctionWrapHandler,
+    field_validator,
+    model_serializer,
+)
+
+from airl_mav.core.errors import UsageError
+from airl_mav.core.fields import ProfileModel
+
+MOST_TRIANGLES = 200_000
+"""Of one mesh."""
+
+GREATEST_M = 50.0
+"""Greatest distance of a corner from its asset's place, along each axis [m]."""
+
+CONTENT = {"content": True}
+"""Context of a serialisation that says what things are, and not where they lie."""
+
+
+class MeshFile(ProfileModel):
+    """Triangles that cameras see in place of the parts, which stay what is hit."""
+
+    file: str = Field(
+        min_length=1,
+        description="the triangles, as `airl asset` writes them (.npz); a path from the profile's"
+        " folder",
+    )
+    sha256: str = Field(description="SHA-256 of that file, hexadecimal")
+
+    @field_validator("sha256")
+    @classmethod
+    def _is_a_digest(cls, value: str) -> str:
+        if len(value) != 64 or set(value) - set("0123456789abcdef"):
+            raise ValueError(f"{value!r}; accepted: 64 hexadecimal digits")
+        return value
+
+    @model_serializer(mode="wrap")
+    def _without_place(
+        self, dump: SerializerFunctionWrapHandler, info: SerializationInfo
+    ) -> dict[str, Any]:
+        """Leave out where the file lies where only content counts: its digest tells that."""
+        data: dict[str, Any] = dump(self)
+        if info.context == CONTENT:
+            del data["file"]
+        return data
+
+
+def read_checked(mesh: MeshFile) -> bytes:
+    """Return the bytes of a file. Raises UsageError where it is gone, or another one."""
+    try:
+        data = Path(mesh.file).read_bytes()
+    except OSError as error:
+        raise UsageError(f"{mesh.file}: {error.strerror}") from None
+    found = hashlib.sha256(data).hexdigest()
+    if found != mesh.sha256:
+        raise UsageError(
+            f"{mesh.file}: changed since its arena was made: SHA-256 {found[:16]}...; accepted: "
+            f"{mesh.sha256[:16]}..."
+        )
+    return data
