@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.appearance import Drawn, Statics, draw_appearance
 from airl_mav.core.constants import US_PER_S
+from airl_mav.core.goals import Goal
 from airl_mav.profiles.appearance import DEFAULT, Appearance
 
 
@@ -85,6 +86,14 @@ class Arena:
     """What the look is drawn from; geometry and depth know none of it."""
     statics: Statics | None = None
     """None: every primitive that stands is a thing of its own."""
+    goal_height_m: float | None = None
+    """Of the goal, above the floor; None: it has none, and is reached at any height."""
+
+    @property
+    def goal_point(self) -> Goal:
+        """The goal as flights are told of it."""
+        north, east = self.goal.tolist()
+        return (north, east) if self.goal_height_m is None else (north, east, -self.goal_height_m)
 
     @cached_property
     def look(self) -> Drawn:

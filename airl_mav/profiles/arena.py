@@ -5,7 +5,13 @@ from __future__ import annotations
 import re
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import (
+    Field,
+    SerializerFunctionWrapHandler,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
 
 from airl_mav.core.fields import Each, ProfileModel, quantity
 from airl_mav.core.plugins import GENERATORS, part_name
@@ -21,6 +27,12 @@ Option = bool | int | float | str | list[int | float | str]
 
 ASSET_NAME = re.compile("[a-z]+(-[a-z]+)*")
 """What things of the user's may be called: what is hit is called after it."""
+
+GATE = "gate"
+"""What a wall with an opening is called where it is hit."""
+
+EDGE_M = 0.1
+"""Least wall on each side of an opening, below and above it [m]."""
 
 SPHERE_OFFSET = 0.5
 """A sphere's centre is at most this share of its radius off the flight altitude."""
@@ -63,6 +75,19 @@ class Goal(ProfileModel):
     clearance_m: float = quantity(
         "free way around the goal, to static obstacles and walls", "m", ge=0.5, le=50, default=2
     )
+    height_m: Annotated[tuple[float, float], Each(0.2, 50, ascending=True)] | None = quantity(
+        "height of the goal above the floor, drawn from [least, greatest]; one number: always that;"
+        " left out: it has none, and is reached at any height",
+        "m",
+        default=None,
+    )
+
+    @field_validator("height_m", mode="before")
+    @classmethod
+    def _one_height(cls, value: object) -> object:
+        """Take one number for both ends of the range."""
+        one = isinstance(value, int | float) and not isinstance(value, bool)
+        return (value, value) if one else value
 
     @model_validator(mode="after")
     def _both_or_none(self) -> Goal:
@@ -121,6 +146,45 @@ class MovingObstacles(StaticObstacles):
     )
 
 
+class Gates(ProfileModel):
+    """Walls from the west to the east wall, each with an opening, between the start and the goal.
+
+    They stand one behind the other, and are as high as the walls of the arena. Ranges are [least,
+    greatest], drawn uniformly, one by one.
+    """
+
+    count: Annotated[tuple[int, int], Each(0, 20, ascending=True)] = quantity(
+        "how many", "1", default=(0, 0)
+    )
+    first_m: Annotated[tuple[float, float], Each(1, 500, ascending=True)] = quantity(
+        "way from the start to the middle of the first", "m", default=(7.0, 8.0)
+    )
+    spacing_m: Annotated[tuple[float, float], Each(1, 500, ascending=True)] = quantity(
+        "way from the middle of one to that of the next", "m", default=(9.0, 10.0)
+    )
+    lateral_m: Annotated[tuple[float, float], Each(-500, 500, ascending=True)] = quantity(
+        "place of the middle of an opening, east of the start", "m", default=(-4.0, 4.0)
+    )
+    middle_m: Annotated[tuple[float, float], Each(0.2, 50, ascending=True)] = quantity(
+        "height of the middle of an opening above the floor", "m", default=(2.0, 3.0)
+    )
+    width_m: Annotated[tuple[float, float], Each(0.2, 50, ascending=True)] = quantity(
+        "width of an opening", "m", default=(2.0, 3.0)
+    )
+    height_m: Annotated[tuple[float, float], Each(0.2, 50, ascending=True)] = quantity(
+        "height of an opening", "m", default=(1.6, 2.4)
+    )
+    thickness_m: float = quantity("of these walls", "m", ge=0.05, le=5, default=0.2)
+
+    @property
+    def last_m(self) -> float:
+        """Farthest from the start that the north side of one may be [m]; 0: there is none."""
+        if self.count[1] == 0:
+            return 0.0
+        behind = (self.count[1] - 1) * self.spacing_m[1]
+        return self.first_m[1] + behind + 0.5 * self.thickness_m
+
+
 class ArenaSpec(ProfileModel):
     """Knobs of an arena; defaults are the paper's where it has them (arXiv 1906.00421).
 
@@ -172,6 +236,9 @@ class ArenaSpec(ProfileModel):
     moving: MovingObstacles = Field(
         default_factory=MovingObstacles, description="obstacles that move"
     )
+    gates: Gates = Field(
+        default_factory=Gates, description="walls with openings that are on the way to the goal"
+    )
     assets: dict[str, Asset] = Field(
         default_factory=dict, description="things of your own, made of parts, by name"
     )
@@ -192,6 +259,10 @@ class ArenaSpec(ProfileModel):
             del data["appearance"]
         if not self.assets and self.asset_scale == (1.0, 1.0):
             del data["assets"], data["asset_scale"]
+        if self.gates == Gates():
+            del data["gates"]
+        if self.goal.height_m is None:
+            del data["goal"]["height_m"]
         return data
 
     @property
@@ -208,6 +279,7 @@ class ArenaSpec(ProfileModel):
         self._check_start()
         self._check_goal()
         self._check_assets()
+        self._check_gates()
         for name in ("static", "moving"):
             self._check_heights(name, getattr(self, name))
         return self
@@ -223,6 +295,12 @@ class ArenaSpec(ProfileModel):
                 )
 
     def _check_goal(self) -> None:
+        wall, heights = self.size.height_m, self.goal.height_m
+        if heights is not None and heights[1] > wall:
+            raise ValueError(
+                f"goal.height_m = {list(heights)}: accepted: value <= {wall:g} m (size.height_m,"
+                " the walls)"
+            )
         if self.goal.fixed is None:
             if self.goal.min_distance_m >= self.zones_m[0]:
                 raise ValueError(
@@ -239,6 +317,62 @@ class ArenaSpec(ProfileModel):
                     f"goal.{axis} = {value:g}: accepted: {low:g} <= value <= {high:g} m from the "
                     f"start (inside the walls, goal.clearance_m {free:g})"
                 )
+
+    def _check_gates(self) -> None:
+        gates, wall, start = self.gates, self.size.height_m, self.start
+        if gates.count[1] == 0:
+            return
+        if self.generator != OBSTACLES:
+            raise ValueError(
+                f"gates.count = {list(gates.count)}: accepted: 0 with a generator of your own"
+            )
+        if GATE in self.assets:
+            raise ValueError(f"assets.{GATE}: accepted: another name where there are gates")
+        if gates.first_m[0] < start.clearance_m + 0.5 * gates.thickness_m:
+            raise ValueError(
+                f"gates.first_m = {list(gates.first_m)}: accepted: value >= "
+                f"{start.clearance_m + 0.5 * gates.thickness_m:g} m (start.clearance_m)"
+            )
+        if gates.count[1] > 1 and gates.spacing_m[0] <= gates.thickness_m:
+            raise ValueError(
+                f"gates.spacing_m = {list(gates.spacing_m)}: accepted: value > "
+                f"{gates.thickness_m:g} m (gates.thickness_m)"
+            )
+        half = 0.5 * gates.width_m[1] + EDGE_M
+        west, east = half - start.east_m, self.size.east_m - start.east_m - half
+        if not west <= gates.lateral_m[0] <= gates.lateral_m[1] <= east:
+            raise ValueError(
+                f"gates.lateral_m = {list(gates.lateral_m)}: accepted: {west:g} <= value <= "
+                f"{east:g} m (an opening of gates.width_m {gates.width_m[1]:g}, and {EDGE_M:g} m of"
+                " wall on either side)"
+            )
+        half = 0.5 * gates.height_m[1] + EDGE_M
+        if not half <= gates.middle_m[0] <= gates.middle_m[1] <= wall - half:
+            raise ValueError(
+                f"gates.middle_m = {list(gates.middle_m)}: accepted: {half:g} <= value <= "
+                f"{wall - half:g} m (an opening of gates.height_m {gates.height_m[1]:g}, and "
+                f"{EDGE_M:g} m of wall below and above, size.height_m {wall:g})"
+            )
+        self._check_behind_gates()
+
+    def _check_behind_gates(self) -> None:
+        """Refuse gates that leave no room for the goal behind the last of them."""
+        last, free = self.gates.last_m, self.goal.clearance_m
+        fixed = self.goal.fixed
+        if fixed is not None:
+            if fixed[0] < last + free:
+                raise ValueError(
+                    f"goal.north_m = {fixed[0]:g}: accepted: value >= {last + free:g} m, behind the"
+                    f" last of the gates (goal.clearance_m {free:g})"
+                )
+            return
+        far = min(self.zones_m[-1], self.size.north_m - self.start.north_m - free)
+        if last + free >= far:
+            raise ValueError(
+                f"gates.count = {list(self.gates.count)}: the last may be {last:g} m from the "
+                f"start; accepted: less than {far - free:g} m, so that there is room for the goal "
+                f"behind it (zones_m, size.north_m, goal.clearance_m {free:g})"
+            )
 
     def _check_assets(self) -> None:
         for name, asset in self.assets.items():
