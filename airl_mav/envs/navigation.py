@@ -8,6 +8,7 @@ as well. Everything is in ticks of simulated time, so nothing depends on the mac
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -79,7 +80,7 @@ class Flights:
     """Flown so far [m]."""
     energy_j: NDArray[np.float64]
     goal_distance_m: NDArray[np.float64]
-    """Horizontal, true."""
+    """True; seen from above, where the goal has no height."""
     speed_m_s: NDArray[np.float64]
     """Three-dimensional, true."""
     battery: NDArray[np.float64]
@@ -163,7 +164,11 @@ class Navigation(Stateful):
             kind=self.camera.kind,
             frames=spec.frames,
             in_flight=spec.in_flight,
+            goal_height=spec.goal_height,
         )
+        if spec.goal_height and self.arena_spec.goal.height_m is None:
+            accepted = "true in an arena whose profile gives the goal a height (goal.height_m)"
+            raise UsageError(f"goal_height = true: arena {spec.arena!r} gives none; {accepted}")
         self.intrinsics: Intrinsics = Intrinsics.of(self.camera)
         if problem := camera_mismatch(self.observation, self.intrinsics):
             raise UsageError(f"image_width_px, image_height_px: {problem}")
@@ -289,6 +294,8 @@ class Navigation(Stateful):
         else:
             image, state = self.cameras.image[rows], self.kinematics(rows)
         goal = self._places.batch.goal[rows]
+        if np.isnan(goal[:, 2]).all():
+            goal = goal[:, :2]
         return observe(image, self.intrinsics, state, goal, known.told(rows), known.earlier(rows))
 
     def observe(self, slots: Sequence[int] | None = None) -> Encoded:
@@ -305,13 +312,14 @@ class Navigation(Stateful):
     def flights(self, rows: Rows = EVERYONE) -> Flights:
         """Return the status of all flights, or of those in `rows`; copies."""
         fleet = self.fleet
-        to_goal = self._places.batch.goal[rows] - fleet.position[rows, :2]
+        to_goal = self._places.batch.goal[rows] - fleet.position[rows]
+        away, below = np.hypot(to_goal[:, 0], to_goal[:, 1]), to_goal[:, 2]
         return Flights(
             verdict=np.array(fleet.verdict[rows]),
             time_s=fleet.time_us[rows] / US_PER_S,
             distance_m=np.array(fleet.distance[rows]),
             energy_j=np.array(fleet.energy[rows]),
-            goal_distance_m=np.hypot(to_goal[:, 0], to_goal[:, 1]),
+            goal_distance_m=np.where(np.isnan(below), away, np.hypot(away, below)),
             speed_m_s=np.linalg.norm(fleet.velocity[rows], axis=1),
             battery=np.array(fleet.battery[rows]),
             touched=np.array(fleet.touched[rows]),
@@ -331,14 +339,18 @@ class Navigation(Stateful):
         """Fly one decision of every flight that has not ended.
 
         Args:
-            commands: (n, 3) forward, right [m/s], yaw rate [rad/s].
+            commands: (n, 3) forward, right [m/s], yaw rate [rad/s]: an altitude is held; or
+                (n, 4): behind them the downward speed [m/s].
 
         Raises:
             ValueError: Not n commands.
         """
-        if commands.shape != (self.n, 3):
-            raise ValueError(f"commands of shape {commands.shape}: accepted: ({self.n}, 3)")
-        setpoints = np.insert(commands, 2, 0.0, axis=1)
+        if commands.shape not in ((self.n, 3), (self.n, 4)):
+            accepted = f"({self.n}, 3) or ({self.n}, 4)"
+            raise ValueError(f"commands of shape {commands.shape}: accepted: {accepted}")
+        # NaN: decided when it is sent.
+        down = commands[:, 3] if commands.shape[1] == 4 else math.nan
+        setpoints = np.insert(commands[:, :3], 2, down, axis=1)
         if self._trace is not None:
             self._trace.deciding(self.fleet)
         began_us = self.fleet.time_us.copy()
