@@ -110,7 +110,7 @@ def with_gates(statics: Statics | None, standing: Obstacles, k: int) -> Statics 
 def openings_of(arena: Arena) -> Openings:
     """Return the openings of an arena's gates, as its bodies have them."""
     first = np.flatnonzero(_part_of_gate(arena) == 0)
-    center, half = arena.obstacles.center[:, :], arena.obstacles.half_size[:, :]
+    center, half = arena.obstacles.center, arena.obstacles.half_size
     west, below, above = first, first + 2, first + 3
     bottom = center[below, 2] - half[below, 2]
     top = center[above, 2] + half[above, 2]

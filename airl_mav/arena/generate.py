@@ -177,9 +177,7 @@ def _check_fixed_goal(request: _Request, zone: int | None) -> None:
         )
 
 
-def _check_openings(
-    openings: Openings, name: str, seed: int, vehicle_width_m: float
-) -> None:
+def _check_openings(openings: Openings, name: str, seed: int, vehicle_width_m: float) -> None:
     """Refuse an opening that the vehicle does not fit through, whatever way it leans."""
     if not len(openings):
         return

@@ -398,9 +398,7 @@ def _move(state: State, vehicle: Vehicle, kept: float) -> None:
 
 
 @kernel
-def _verdict(
-    here: Vec, goal: Vec, hit: int, battery: float, time_us: int, rules: Rules
-) -> int:
+def _verdict(here: Vec, goal: Vec, hit: int, battery: float, time_us: int, rules: Rules) -> int:
     """Return what a tick has decided, FLYING mostly."""
     # Never given the whole fleet: counting the references to its arrays takes longer than a tick.
     away = (here[0] - goal[0]) ** 2 + (here[1] - goal[1]) ** 2

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from airl_mav.camera.conditions import check_noise
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.constants import TICK_US, US_PER_MS, US_PER_S
-from airl_mav.core.errors import UsageError
+from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.streams import Stream, stream
 from airl_mav.envs.arenas import ArenaBatch, move_all_obstacles
 from airl_mav.envs.cameras import Cameras
@@ -56,7 +56,7 @@ from airl_mav.policy.layouts import encode_layout
 from airl_mav.policy.observation import Kinematics, Observation, Rows, observe
 from airl_mav.policy.observation_spec import Encoded, ObservationSpec, camera_mismatch
 from airl_mav.prediction.compensator import Compensator
-from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.profiles.arena import OBSTACLES, ArenaSpec
 from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.conditions import Payload
 from airl_mav.profiles.loaded import check_spread, equipped
@@ -166,9 +166,13 @@ class Navigation(Stateful):
             in_flight=spec.in_flight,
             goal_height=spec.goal_height,
         )
-        if spec.goal_height and self.arena_spec.goal.height_m is None:
-            accepted = "true in an arena whose profile gives the goal a height (goal.height_m)"
-            raise UsageError(f"goal_height = true: arena {spec.arena!r} gives none; {accepted}")
+        known = self.arena_spec.generator == OBSTACLES
+        if spec.goal_height and known and self.arena_spec.goal.height_m is None:
+            raise FieldError(
+                "goal_height",
+                True,
+                f"false in arena {spec.arena!r}, whose profile has no goal.height_m",
+            )
         self.intrinsics: Intrinsics = Intrinsics.of(self.camera)
         if problem := camera_mismatch(self.observation, self.intrinsics):
             raise UsageError(f"image_width_px, image_height_px: {problem}")

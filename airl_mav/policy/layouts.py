@@ -99,7 +99,8 @@ def encode_layout(spec: ObservationSpec, seen: Observation, shrink: Shrink = NUM
         `body`.
         `body`: velocity forward, right, down / 5 m/s; goal as cosine and sine of its bearing and
         its distance / 20 m; with `goal_height` (n, 4): behind them how far it lies below the
-        vehicle / 5 m, and the distance is the level one. `paper`: velocity NED [m/s]; goal as north, east [m] and distance [m].
+        vehicle / 5 m, and the distance is the level one. `paper`: velocity NED [m/s]; goal as
+        north, east [m] and distance [m].
         Where the network is told more, `in_flight` (n, k) float32: forward, right / 5 m/s and yaw
         rate [rad/s]; latency [s]; age [s].
 

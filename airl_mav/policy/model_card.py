@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 
+from airl_mav.policy.action_sets import commands_vertical_speed
 from airl_mav.policy.card import MeasuredResult, PolicyCard
 
 MODEL_CARD_FILE = "README.md"
@@ -65,13 +66,15 @@ def _page(card: PolicyCard) -> Iterator[str]:
     image = f"{seen.kind} image"
     image = image if seen.projection == "pinhole" else f"{seen.projection} {image}"
     far = f", up to {seen.range_m:g} m" if seen.kind == "depth" else ""
+    high = " with its height" if seen.goal_height else ""
     yield (
         f"| sees | {image} of {seen.width_px}x{seen.height_px} px, {seen.horizontal_fov_deg:g} "
-        f"deg wide{far}; own velocity; goal (layout `{seen.layout}`) |"
+        f"deg wide{far}; own velocity; goal{high} (layout `{seen.layout}`) |"
     )
     yield f"| decides | `{actions.set}`, up to {actions.max_speed_m_s:.3g} m/s |"
     yield f"| holds each action | {card.hold_s:g} s |"
-    yield f"| flies at | {card.altitude_m:g} m, to within {card.goal_radius_m:g} m of the goal |"
+    flies = "begins" if commands_vertical_speed(actions) else "flies"
+    yield f"| {flies} at | {card.altitude_m:g} m, to within {card.goal_radius_m:g} m of the goal |"
     yield f"| network | {' '.join(card.network.split())} |"
     yield f"| size | {card.parameters:,} parameters, {card.macs:,} multiply-accumulates |"
     if card.algorithm:

@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from airl_mav.arena.appearance import Statics
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Tour
+from airl_mav.core.goals import Goal
 from airl_mav.profiles.appearance import DEFAULT, Appearance
 from airl_mav.profiles.projection import Projection
 from airl_mav.profiles.vehicle import Momentum, VehicleProfile
@@ -68,6 +69,7 @@ class ArenaShown(Message):
     goal: tuple[float, float]
     appearance: Appearance = DEFAULT
     statics: StaticsShown | None = None
+    goal_height_m: float | None = None
 
     @classmethod
     def of(cls, arena: Arena) -> ArenaShown:
@@ -94,6 +96,7 @@ class ArenaShown(Message):
             goal=(north, east),
             appearance=arena.appearance,
             statics=statics,
+            goal_height_m=arena.goal_height_m,
         )
 
     def arena(self) -> Arena:
@@ -116,6 +119,7 @@ class ArenaShown(Message):
             statics=None
             if known is None
             else Statics(known.names, np.array(known.of, np.int64), known.materials),
+            goal_height_m=self.goal_height_m,
         )
 
 
@@ -168,8 +172,8 @@ class Episode(Message):
     arena: ArenaShown | None
     """None: an endless floor."""
     vehicle: VehicleShape
-    goal: tuple[float, float]
-    """North, east [m]."""
+    goal: Goal
+    """North, east [m], and down where it has a height."""
     goal_radius_m: float
 
 
@@ -226,7 +230,7 @@ class Flight(Message):
     kind: Literal["flight"] = "flight"
     index: int
     seed: int
-    goal: tuple[float, float]
+    goal: Goal
 
 
 class Phase(Message):
