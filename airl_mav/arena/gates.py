@@ -132,10 +132,8 @@ def over_openings(arena: Arena) -> NDArray[np.bool_]:
 def _part_of_gate(arena: Arena) -> NDArray[np.int64]:
     """Return (n_static,) which of the PARTS of a gate each primitive is; -1: of none."""
     parts = np.full(arena.n_static, -1, np.int64)
-    if arena.statics is not None:
-        gates = np.array([name == GATE for name in arena.statics.names], np.bool_)
-        mine = np.flatnonzero(gates[arena.statics.of]) if len(gates) else np.zeros(0, np.int64)
-        parts[mine] = np.arange(len(mine)) % PARTS
+    boxes = PARTS * arena.n_gates
+    parts[arena.n_static - boxes :] = np.arange(boxes) % PARTS
     return parts
 
 

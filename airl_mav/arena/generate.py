@@ -128,6 +128,7 @@ def generate(
             appearance=spec.appearance,
             statics=with_gates(statics, static, len(openings)),
             goal_height_m=_draw_height(seed, spec),
+            n_gates=len(openings),
         )
     raise UsageError(f"arena {name!r}, seed {seed}: {failure} (best of {LAYOUTS} layouts)")
 

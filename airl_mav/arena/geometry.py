@@ -88,6 +88,8 @@ class Arena:
     """None: every primitive that stands is a thing of its own."""
     goal_height_m: float | None = None
     """Of the goal, above the floor; None: it has none, and is reached at any height."""
+    n_gates: int = 0
+    """The boxes of so many gates are the last of those obstacles that stand (`arena.gates`)."""
 
     @property
     def goal_point(self) -> Goal:

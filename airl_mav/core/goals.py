@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import numpy as np
+from numpy.typing import NDArray
+
 Goal = tuple[float, float] | tuple[float, float, float]
 """North, east of the start [m]; where the goal has a height also down: above the start it is
 negative."""
 
 
-def goal_distance_m(goal: Goal, position: Sequence[float]) -> float:
+def goal_distance_m(goal: Goal, position: Sequence[float] | NDArray[np.float64]) -> float:
     """Return how far a position NED (3,) [m] is from a goal: seen from above, if it has no height.
 
     Args:

@@ -349,7 +349,7 @@ class Navigation(Stateful):
         Raises:
             ValueError: Not n commands.
         """
-        if commands.shape not in ((self.n, 3), (self.n, 4)):
+        if commands.ndim != 2 or len(commands) != self.n or commands.shape[1] not in (3, 4):
             accepted = f"({self.n}, 3) or ({self.n}, 4)"
             raise ValueError(f"commands of shape {commands.shape}: accepted: {accepted}")
         # NaN: decided when it is sent.

@@ -209,7 +209,9 @@ def from_its_start(episode: FlownEpisode) -> FlownEpisode:
         velocity=turn.apply(path.velocity),
         quaternion=attitude.as_quat(scalar_first=True),
     )
-    turned: Goal = (float(goal[0]), float(goal[1]), *down)
+    turned: Goal = (float(goal[0]), float(goal[1]))
+    if down:
+        turned = (*turned[:2], down[0])
     return replace(episode, trajectory=moved, record=replace(record, goal=turned))
 
 

@@ -326,8 +326,6 @@ class ArenaSpec(ProfileModel):
             raise ValueError(
                 f"gates.count = {list(gates.count)}: accepted: 0 with a generator of your own"
             )
-        if GATE in self.assets:
-            raise ValueError(f"assets.{GATE}: accepted: another name where there are gates")
         if gates.first_m[0] < start.clearance_m + 0.5 * gates.thickness_m:
             raise ValueError(
                 f"gates.first_m = {list(gates.first_m)}: accepted: value >= "

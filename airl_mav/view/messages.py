@@ -70,6 +70,7 @@ class ArenaShown(Message):
     appearance: Appearance = DEFAULT
     statics: StaticsShown | None = None
     goal_height_m: float | None = None
+    n_gates: int = 0
 
     @classmethod
     def of(cls, arena: Arena) -> ArenaShown:
@@ -97,6 +98,7 @@ class ArenaShown(Message):
             appearance=arena.appearance,
             statics=statics,
             goal_height_m=arena.goal_height_m,
+            n_gates=arena.n_gates,
         )
 
     def arena(self) -> Arena:
@@ -120,6 +122,7 @@ class ArenaShown(Message):
             if known is None
             else Statics(known.names, np.array(known.of, np.int64), known.materials),
             goal_height_m=self.goal_height_m,
+            n_gates=self.n_gates,
         )
 
 
