@@ -344,7 +344,7 @@ class Navigation(Stateful):
 
         Args:
             commands: (n, 3) forward, right [m/s], yaw rate [rad/s]: an altitude is held; or
-                (n, 4): behind them the downward speed [m/s].
+                (n, 4): behind them the downward speed [m/s], NaN where the altitude is held.
 
         Raises:
             ValueError: Not n commands.

@@ -91,8 +91,8 @@ def test_the_goal_is_behind_the_last_gate_at_a_height_of_its_range(
         openings = openings_of(arena)
         last = openings.center[-1, 0] + openings.half_size[-1, 0]
         assert arena.goal[0] >= last + spec.goal.clearance_m - 1e-9
-        north, east, down = arena.goal_point
-        assert (north, east, -down) == (*arena.goal.tolist(), arena.goal_height_m)
+        assert arena.goal_height_m is not None
+        assert arena.goal_point == (*arena.goal.tolist(), -arena.goal_height_m)
 
 
 def test_the_same_seed_is_the_same_arena_and_others_differ(spec: ArenaSpec) -> None:
