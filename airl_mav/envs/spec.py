@@ -297,6 +297,12 @@ class EnvironmentSpec(ProfileModel):
             )
         return self
 
+    @model_validator(mode="after")
+    def _told_of_heights(self) -> EnvironmentSpec:
+        if self.goal_height and self.layout == "paper":
+            raise ValueError("goal_height = true: accepted: false with layout 'paper'")
+        return self
+
     @property
     def action_spec(self) -> ActionSpec:
         """The action set with its fastest speed."""
