@@ -61,7 +61,10 @@ def _page(card: PolicyCard) -> Iterator[str]:
     if description := " ".join(card.description.split()).rstrip("."):
         yield from (f"{description[0].upper()}{description[1:]}.", "")
     yield from ("A policy of airl-mav that flies a quadcopter to a goal. In this folder:", "")
-    yield from ("```sh", "airl-sitl --policy .", "airl evaluate . --episodes 100", "```", "")
+    # One that is told of the goal's height cannot fly where goals have none, as by default.
+    where = f" --arena {training.arena}" if seen.goal_height and training.arena else ""
+    flown = f"airl-sitl --policy .{where}", f"airl evaluate .{where} --episodes 100"
+    yield from ("```sh", *flown, "```", "")
     yield from ("| | |", "|---|---|")
     image = f"{seen.kind} image"
     image = image if seen.projection == "pinhole" else f"{seen.projection} {image}"

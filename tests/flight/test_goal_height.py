@@ -9,13 +9,15 @@ import numpy as np
 import pytest
 import tomli_w
 
-from airl_mav.envs.evaluation import SinglePilots, fly_seeds
+from airl_mav.arena.gates import openings_of
+from airl_mav.envs.evaluation import LearnedPilots, SinglePilots, fly_seeds
 from airl_mav.envs.fleet import Verdict
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import spec_of
 from airl_mav.flight.judge import Outcome
 from airl_mav.lockstep.flight import fly
 from airl_mav.policy.actions import Action
+from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.policy.observation import Observation
 from tests.support.lockstep_kit import demo_scenario
 
@@ -111,3 +113,29 @@ def test_passing_below_the_goal_is_not_reaching_it(arena: Path) -> None:
     path = flown.trajectory.between(flown.record.navigation_us or 0, flown.record.ended_us)
     away = np.hypot(path.position[:, 0] - NORTH_M, path.position[:, 1])
     assert away.min() < 0.5 * RADIUS_M
+
+
+def test_the_shipped_policy_flies_through_the_gates_at_both_levels() -> None:
+    """Seed 1 has three gates. Where it crosses their planes, it is within their openings."""
+    seed = 1
+    scenario = demo_scenario(policy="gates", arena="gates", seed=seed, time_limit_s=60.0)
+    policy = scenario.fresh_policy(seed)
+    flown = fly(scenario, policy, 0, seed)
+    assert flown.record.outcome is Outcome.SUCCESS, flown.record.reason
+    openings = openings_of(scenario.arena_of(seed))
+    path = flown.trajectory.between(flown.record.navigation_us or 0, flown.record.ended_us).position
+    assert len(openings) == 3
+    for center, half in zip(openings.center, openings.half_size, strict=True):
+        (crossed,) = np.flatnonzero((path[:-1, 0] < center[0]) & (path[1:, 0] >= center[0]))
+        # A sample is a few centimetres away from the plane.
+        assert (np.abs(path[crossed, 1:] - center[1:]) < half[1:]).all()
+    rules = {"hold_s": 0.2, "goal_radius_m": 1.0, "time_limit_s": 60.0}
+    knobs = {"actions": "velocity3d-fixed-yaw", "max_speed_m_s": 4.0, "goal_height": True}
+    size = {"image_width_px": 32, "image_height_px": 24, "frames": 4}
+    environment = spec_of(None, {"arena": "gates", "episode": rules} | knobs | size)
+    assert isinstance(policy, LearnedPolicy)
+    pilots = LearnedPilots(policy, np.random.default_rng)
+    ((_, twin),) = fly_seeds(Navigation(environment, 1), pilots, [seed])
+    assert twin.verdict == Verdict.SUCCESS
+    navigated_s = (flown.record.ended_us - (flown.record.navigation_us or 0)) / 1e6
+    assert twin.flight_time_s == pytest.approx(navigated_s, rel=0.1)
