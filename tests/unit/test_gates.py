@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 from typing import Any
 
@@ -10,9 +11,12 @@ import pytest
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from pydantic import ValidationError
+from rich.console import Console
 from scipy import ndimage, stats
 
+from airl_mav.arena.describe import arena_table
 from airl_mav.arena.draw import OPENING_COLOUR, draw_arena
+from airl_mav.arena.footprints import bounding_boxes
 from airl_mav.arena.gates import openings_of, over_openings
 from airl_mav.arena.generate import free_area_fraction, generate
 from airl_mav.arena.geometry import Arena
@@ -219,6 +223,32 @@ def test_pictures_show_openings_and_the_floor_counts_once(arenas: list[Arena]) -
     b = arena.bounds
     share = arena.n_gates * 0.2 / (b.north_max - b.north_min)
     assert 1.0 - free_area_fraction(arena) == pytest.approx(share, rel=0.5)
+
+
+def test_the_table_tells_of_them(spec: ArenaSpec, arenas: list[Arena]) -> None:
+    arena, console = arenas[0], Console(width=120, file=io.StringIO())
+    console.print(arena_table(arena, spec))
+    assert isinstance(console.file, io.StringIO)
+    told = console.file.getvalue()
+    (place,), (half,) = openings_of(arena).center[:1], openings_of(arena).half_size[:1]
+    assert f"{place[0]:.2f} N {place[1]:.2f} E, {-place[2]:.2f} m high" in told
+    assert f"{2 * half[1]:.2f} x {2 * half[2]:.2f} m" in told
+    assert f"{arena.goal_height_m:.2f} m" in told
+
+
+def test_obstacles_keep_off_the_gates(spec: ArenaSpec) -> None:
+    crowd = changed(spec, static={"count": [4, 6], "half_width_m": [0.3, 0.6]}, min_clearance_m=1.5)
+    for seed in range(30):
+        arena = made(crowd, seed)
+        gate = np.arange(arena.n_static) >= arena.n_static - 4 * arena.n_gates
+        boxes = bounding_boxes(arena.obstacles)
+        assert 4 <= (~gate).sum() <= 6
+        assert len(openings_of(arena)) == arena.n_gates
+        for i in np.flatnonzero(~gate):
+            gap = np.abs(boxes.center[gate, 0] - boxes.center[i, 0])
+            gap -= boxes.half[gate, 0] + boxes.half[i, 0]
+            assert gap.min() >= 1.5 - 1e-9
+            assert "gate" not in arena.name_of(int(i))
 
 
 # --- what is refused
