@@ -17,6 +17,7 @@ from airl_mav.core.fields import Each, ProfileModel, quantity
 from airl_mav.core.plugins import GENERATORS, part_name
 from airl_mav.profiles.appearance import DEFAULT, Appearance
 from airl_mav.profiles.assets import ASSETS, Asset
+from airl_mav.profiles.gates import Gates, check_gates
 
 ShapeName = Literal["box", "cylinder", "sphere"]
 SHAPES: tuple[ShapeName, ...] = get_args(ShapeName)
@@ -27,12 +28,6 @@ Option = bool | int | float | str | list[int | float | str]
 
 ASSET_NAME = re.compile("[a-z]+(-[a-z]+)*")
 """What things of the user's may be called: what is hit is called after it."""
-
-GATE = "gate"
-"""What a wall with an opening is called where it is hit."""
-
-EDGE_M = 0.1
-"""Least wall on each side of an opening, below and above it [m]."""
 
 SPHERE_OFFSET = 0.5
 """A sphere's centre is at most this share of its radius off the flight altitude."""
@@ -144,45 +139,6 @@ class MovingObstacles(StaticObstacles):
     clearance_m: float = quantity(
         "least gap to static obstacles and walls on the way", "m", ge=0.05, le=10, default=0.25
     )
-
-
-class Gates(ProfileModel):
-    """Walls from the west to the east wall, each with an opening, between the start and the goal.
-
-    They stand one behind the other, and are as high as the walls of the arena. Ranges are [least,
-    greatest], drawn uniformly, one by one.
-    """
-
-    count: Annotated[tuple[int, int], Each(0, 20, ascending=True)] = quantity(
-        "how many", "1", default=(0, 0)
-    )
-    first_m: Annotated[tuple[float, float], Each(1, 500, ascending=True)] = quantity(
-        "way from the start to the middle of the first", "m", default=(7.0, 8.0)
-    )
-    spacing_m: Annotated[tuple[float, float], Each(1, 500, ascending=True)] = quantity(
-        "way from the middle of one to that of the next", "m", default=(9.0, 10.0)
-    )
-    lateral_m: Annotated[tuple[float, float], Each(-500, 500, ascending=True)] = quantity(
-        "place of the middle of an opening, east of the start", "m", default=(-4.0, 4.0)
-    )
-    middle_m: Annotated[tuple[float, float], Each(0.2, 50, ascending=True)] = quantity(
-        "height of the middle of an opening above the floor", "m", default=(2.0, 3.0)
-    )
-    width_m: Annotated[tuple[float, float], Each(0.2, 50, ascending=True)] = quantity(
-        "width of an opening", "m", default=(2.0, 3.0)
-    )
-    height_m: Annotated[tuple[float, float], Each(0.2, 50, ascending=True)] = quantity(
-        "height of an opening", "m", default=(1.6, 2.4)
-    )
-    thickness_m: float = quantity("of these walls", "m", ge=0.05, le=5, default=0.2)
-
-    @property
-    def last_m(self) -> float:
-        """Farthest from the start that the north side of one may be [m]; 0: there is none."""
-        if self.count[1] == 0:
-            return 0.0
-        behind = (self.count[1] - 1) * self.spacing_m[1]
-        return self.first_m[1] + behind + 0.5 * self.thickness_m
 
 
 class ArenaSpec(ProfileModel):
@@ -319,38 +275,19 @@ class ArenaSpec(ProfileModel):
                 )
 
     def _check_gates(self) -> None:
-        gates, wall, start = self.gates, self.size.height_m, self.start
-        if gates.count[1] == 0:
+        if self.gates.count[1] == 0:
             return
         if self.generator != OBSTACLES:
             raise ValueError(
-                f"gates.count = {list(gates.count)}: accepted: 0 with a generator of your own"
+                f"gates.count = {list(self.gates.count)}: accepted: 0 with a generator of your own"
             )
-        if gates.first_m[0] < start.clearance_m + 0.5 * gates.thickness_m:
-            raise ValueError(
-                f"gates.first_m = {list(gates.first_m)}: accepted: value >= "
-                f"{start.clearance_m + 0.5 * gates.thickness_m:g} m (start.clearance_m)"
-            )
-        if gates.count[1] > 1 and gates.spacing_m[0] <= gates.thickness_m:
-            raise ValueError(
-                f"gates.spacing_m = {list(gates.spacing_m)}: accepted: value > "
-                f"{gates.thickness_m:g} m (gates.thickness_m)"
-            )
-        half = 0.5 * gates.width_m[1] + EDGE_M
-        west, east = half - start.east_m, self.size.east_m - start.east_m - half
-        if not west <= gates.lateral_m[0] <= gates.lateral_m[1] <= east:
-            raise ValueError(
-                f"gates.lateral_m = {list(gates.lateral_m)}: accepted: {west:g} <= value <= "
-                f"{east:g} m (an opening of gates.width_m {gates.width_m[1]:g}, and {EDGE_M:g} m of"
-                " wall on either side)"
-            )
-        half = 0.5 * gates.height_m[1] + EDGE_M
-        if not half <= gates.middle_m[0] <= gates.middle_m[1] <= wall - half:
-            raise ValueError(
-                f"gates.middle_m = {list(gates.middle_m)}: accepted: {half:g} <= value <= "
-                f"{wall - half:g} m (an opening of gates.height_m {gates.height_m[1]:g}, and "
-                f"{EDGE_M:g} m of wall below and above, size.height_m {wall:g})"
-            )
+        check_gates(
+            self.gates,
+            west_m=self.start.east_m,
+            east_m=self.size.east_m - self.start.east_m,
+            height_m=self.size.height_m,
+            free_m=self.start.clearance_m,
+        )
         self._check_behind_gates()
 
     def _check_behind_gates(self) -> None:

@@ -121,7 +121,8 @@ class StandAloneVehicle(Aircraft):
     goal_radius_m: GoalRadius | None = Field(
         default=None,
         description="in lockstep: judge the flight, and tell the companion when it is lost; the"
-        " goal is reached closer than this, seen from above; by default nobody judges",
+        " goal is reached closer than this: seen from above, if it has no height; by default"
+        " nobody judges",
     )
     time_limit_s: TimeLimit = Field(
         default=TIME_LIMIT_S,
