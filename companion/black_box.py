@@ -14,7 +14,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol
 
-import numpy as np
 import psutil
 
 from airl_mav.black_box.messages import (
@@ -34,6 +33,7 @@ from airl_mav.black_box.writing import BlackBoxFile
 from airl_mav.core.clock import Clock, processor_time_us, utc_now, utc_us
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError
+from airl_mav.core.goals import Goal, goal_distance_m
 from airl_mav.core.machine import temperature_c
 from airl_mav.core.provenance import describe_machine, git_state, package_versions
 from airl_mav.latency.stamps import NO_STAMP
@@ -79,7 +79,7 @@ class BlackBoxRecorder:
         file: BlackBoxFile,
         link: RecordedLink,
         clock: Clock,
-        goal: tuple[float, float],
+        goal: Goal,
         images_hz: float,
     ) -> None:
         """Take what to record.
@@ -88,7 +88,7 @@ class BlackBoxRecorder:
             file: New.
             link: Connected.
             clock: The companion's.
-            goal: North, east of the start [m].
+            goal: North, east of the start [m], and down where it has a height.
             images_hz: Most images to keep, each one that a decision saw [Hz].
         """
         self.failure: str | None = None
@@ -191,7 +191,7 @@ class BlackBoxRecorder:
         frame = told.seen.frame
         age_us = told.started_us - frame.capture_time_us
         position, velocity, quaternion = _numbers(told.state)
-        (away_m,) = _finite([np.hypot(*(np.array(self._goal) - told.state.position[:2]))])
+        (away_m,) = _finite([goal_distance_m(self._goal, told.state.position)])
         decision = Decision(
             # A camera that stamps by another clock says nothing of its images' age.
             frame.capture_time_us if 0 <= age_us <= OLDEST_FRAME_US else NO_STAMP,
@@ -242,7 +242,7 @@ def open_recorder(
     run: Mapping[str, Any],
     link: RecordedLink,
     clock: Clock,
-    goal: tuple[float, float],
+    goal: Goal,
 ) -> BlackBoxRecorder:
     """Return what records a mission into a new file of a folder.
 
@@ -251,7 +251,7 @@ def open_recorder(
         run: What flies: `setup` and `config`, as `run.json` has them.
         link: Connected.
         clock: The companion's.
-        goal: North, east of the start [m].
+        goal: North, east of the start [m], and down where it has a height.
 
     Raises:
         FieldError: No file can be written there.

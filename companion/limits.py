@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from airl_mav.camera.frame import Frame
 from airl_mav.core.constants import US_PER_S
+from airl_mav.core.goals import Goal, goal_height_m
 from airl_mav.policy.observation import Kinematics
 from airl_mav.scenario.model import LimitSettings, PilotSettings
 from companion.camera import ReceivedFrame
@@ -69,7 +70,7 @@ CLEARANCE_M = 50.0
 """Default radius around the start: twice the way to the goal, and this much for detours [m]."""
 
 CLIMB_M = 10.0
-"""Default height limit, above the altitude that is flown [m]."""
+"""Default height limit, above the altitude that is flown and the height of the goal [m]."""
 
 OWN_CLOCK_S = 1.0
 """A first frame at most so old is stamped by our clock; else the stamps count from its arrival."""
@@ -118,7 +119,7 @@ class Limits:
     def __init__(
         self,
         settings: LimitSettings,
-        goal: tuple[float, float],
+        goal: Goal,
         pilot: PilotSettings,
         mount_pitch_up_rad: float = 0.0,
     ) -> None:
@@ -126,7 +127,7 @@ class Limits:
 
         Args:
             settings: The bounds.
-            goal: North, east of the start [m].
+            goal: North, east of the start [m], and down where it has a height.
             pilot: How the policy is flown.
             mount_pitch_up_rad: How far the camera looks up, as it is mounted [rad].
         """
@@ -170,16 +171,15 @@ class Limits:
 class VehicleLimits:
     """Rules for what the flight controller says."""
 
-    def __init__(
-        self, settings: LimitSettings, goal: tuple[float, float], pilot: PilotSettings
-    ) -> None:
+    def __init__(self, settings: LimitSettings, goal: Goal, pilot: PilotSettings) -> None:
         self.begun_us = 0
         """When navigation began [µs]."""
         self._silence_us = round(settings.silence_s * US_PER_S)
         radius_m, height_m = settings.radius_m, settings.height_m
-        self.radius_m = 2.0 * math.hypot(*goal) + CLEARANCE_M if radius_m is None else radius_m
+        self.radius_m = 2.0 * math.hypot(*goal[:2]) + CLEARANCE_M if radius_m is None else radius_m
         """Farthest from the start, level [m]."""
-        self.height_m = pilot.altitude_m + CLIMB_M if height_m is None else height_m
+        highest_m = max(pilot.altitude_m, goal_height_m(goal) or 0.0)
+        self.height_m = highest_m + CLIMB_M if height_m is None else height_m
         """Highest above the start [m]."""
         self._flight_s = settings.flight_s
         self._battery = settings.battery

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 from airl_mav.core.clock import Clock
 from airl_mav.core.errors import FieldError, UsageError
+from airl_mav.core.goals import Goal
 from airl_mav.latency.samplers import LatencySampler
 from airl_mav.latency.stamps import DecisionLog
 from airl_mav.policy.actions import CameraBound, Policy
@@ -51,7 +52,7 @@ def fly_mission(
     link: MavsdkLink,
     frames: FrameSource,
     policy: Policy,
-    goal: tuple[float, float],
+    goal: Goal,
     clock: Clock,
     stop: threading.Event,
     abandon: threading.Event,
@@ -73,7 +74,7 @@ def fly_mission(
         link: Connected.
         frames: The camera.
         policy: What decides.
-        goal: North, east [m] from the start.
+        goal: North, east [m] from the start, and down where it has a height.
         clock: Simulated time.
         stop: Set from outside to end the flight early; the vehicle then lands.
         abandon: Set from outside to break off without landing: the vehicle has crashed. The same

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from airl_mav.core.clock import Clock
 from airl_mav.core.constants import US_PER_S
+from airl_mav.core.goals import Goal, goal_distance_m
 from airl_mav.latency.samplers import LatencySampler
 from airl_mav.latency.stamps import NO_STAMP, DecisionLog
 from airl_mav.policy.actions import Policy, limited, vertical_speed
@@ -98,12 +99,12 @@ class Pilot:
         compensator = self.compensator
         self.memory = DecisionMemory(1) if compensator is None else compensator.memory
 
-    def fly(self, goal: tuple[float, float], stop: Event) -> str:
+    def fly(self, goal: Goal, stop: Event) -> str:
         """Decide until the goal is reached, or something ends it; return why, in words.
 
         Where that is a limit, `Limits.ending` has the details.
 
-        The goal lies north, east [m] of the start; `stop`, set from outside, ends the flight.
+        `stop`, set from outside, ends the flight.
         Raises LinkError when the flight controller refuses setpoints.
         """
         sequence = -1
@@ -127,8 +128,7 @@ class Pilot:
             if received is None:
                 continue
             sequence = received.frame.sequence
-            away = np.hypot(goal[0] - state.position[0], goal[1] - state.position[1])
-            if away < self.settings.goal_radius_m:
+            if goal_distance_m(goal, state.position) < self.settings.goal_radius_m:
                 return "goal reached"
             if (reason := self._decide(received, state, goal, stop)) is not None:
                 return reason
@@ -144,7 +144,7 @@ class Pilot:
         return None if ending is None else ending.reason
 
     def _decide(
-        self, seen: ReceivedFrame, state: Kinematics, goal: tuple[float, float], stop: Event
+        self, seen: ReceivedFrame, state: Kinematics, goal: Goal, stop: Event
     ) -> str | None:
         """Run one decision; return why the flight has ended meanwhile, in words."""
         clock, settings = self.clock, self.settings
@@ -156,8 +156,10 @@ class Pilot:
             # Not to be interrupted: a computation is not.
             clock.sleep_until(started_us + self.latency.sample_us())
         ready_us = clock.time_us()
-        # The vertical speed holds the altitude.
-        down = vertical_speed(settings.altitude_m, float(self.link.kinematics().position[2]))
+        down = action.down_m_s
+        if down is None:
+            # The vertical speed holds the altitude.
+            down = vertical_speed(settings.altitude_m, float(self.link.kinematics().position[2]))
         setpoint = BodyVelocity(action.forward_m_s, action.right_m_s, down, action.yaw_rate_rad_s)
         hold_us = int(settings.hold_s * US_PER_S)
         sent_us = clock.time_us()
@@ -205,7 +207,7 @@ class Pilot:
         return None
 
     def _observe(
-        self, seen: ReceivedFrame, state: Kinematics, goal: tuple[float, float], now_us: int
+        self, seen: ReceivedFrame, state: Kinematics, goal: Goal, now_us: int
     ) -> Observation:
         """Return what the policy sees: what is, or what will be when its action is sent."""
         frame, image = seen.frame, seen.frame.image

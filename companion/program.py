@@ -15,6 +15,7 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.clock import Clock, WallClock
 from airl_mav.core.cpu_quota import held_to
 from airl_mav.core.errors import FieldError
+from airl_mav.core.goals import Goal
 from airl_mav.core.provenance import describe_machine
 from airl_mav.flight.setup import Part, Setup
 from airl_mav.latency.samplers import LatencySampler, latency_generator
@@ -26,6 +27,7 @@ from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from airl_mav.scenario.model import LimitSettings, PilotSettings, WatchdogSettings
 from airl_mav.scenario.piloting import (
     between_commands,
+    check_goal_height,
     check_quota,
     decide_piloting,
     load_asked_policy,
@@ -54,7 +56,7 @@ FLIGHT_S = 600.0
 class Mission:
     """What is flown, and how."""
 
-    goal: tuple[float, float]
+    goal: Goal
     """North, east of the start [m]."""
     policy: Policy
     pilot: PilotSettings
@@ -98,6 +100,7 @@ def prepare(asked: StandAloneCompanion) -> Mission:
         raise FieldError(
             "policy", asked.policy, problem=f"does not fit vehicle {asked.vehicle}: {reason}"
         )
+    check_goal_height(policy, asked.goal, "goal", " ".join(f"{metres:g}" for metres in asked.goal))
     if pilot.compensate:
         compensator = Compensator(1, vehicle, Intrinsics.of(vehicle.camera))
     limits = asked.limits

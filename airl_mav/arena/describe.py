@@ -8,6 +8,8 @@ from collections import Counter
 import numpy as np
 from rich.table import Table
 
+from airl_mav.arena.footprints import Floats
+from airl_mav.arena.gates import openings_of
 from airl_mav.arena.generate import free_area_fraction
 from airl_mav.arena.geometry import Arena, Shape, Tour
 from airl_mav.arena.zones import zone_of
@@ -30,13 +32,25 @@ def arena_table(arena: Arena, spec: ArenaSpec) -> Table:
         periods = ", ".join(f"{tour.times_s[-1]:.0f}" for tour in arena.tours)
         table.add_row("  speeds", f"{speeds} m/s")
         table.add_row("  tours repeat after", f"{periods} s")
+    for k, (place, half) in enumerate(zip(*_openings(arena), strict=True)):
+        where = f"{place[0]:.2f} N {place[1]:.2f} E, {-place[2]:.2f} m high"
+        table.add_row(f"  opening of gate {k}", where)
+        table.add_row("    wide, high", f"{2.0 * half[1]:.2f} x {2.0 * half[2]:.2f} m")
     north, east = (float(value) for value in arena.goal)
     zone = zone_of(spec, arena.goal)
     where = "beyond the zones" if zone is None else f"zone {zone}"
     table.add_row("goal from the start", f"{north:.2f} N {east:.2f} E m")
+    if arena.goal_height_m is not None:
+        table.add_row("  height", f"{arena.goal_height_m:.2f} m")
     table.add_row("  distance", f"{math.hypot(north, east):.2f} m, {where}")
     table.add_row("floor free of static obstacles", f"{free_area_fraction(arena):.1%}")
     return table
+
+
+def _openings(arena: Arena) -> tuple[Floats, Floats]:
+    """Return the middles (k, 3) NED and half sizes (k, 3) [m] of the openings of gates."""
+    openings = openings_of(arena)
+    return openings.center, openings.half_size
 
 
 def _shapes(arena: Arena, *, moving: bool) -> str:

@@ -11,7 +11,15 @@ import numpy as np
 from airl_mav.arena.appearance import Statics
 from airl_mav.arena.assets import Things, draw_things
 from airl_mav.arena.bodies import Bodies, draw_bodies
-from airl_mav.arena.footprints import Boxes, Floats, footprint_areas, join
+from airl_mav.arena.footprints import Boxes, Floats, bounding_boxes, footprint_areas, join
+from airl_mav.arena.gates import (
+    Openings,
+    behind,
+    closed_from_above,
+    draw_openings,
+    frames,
+    with_gates,
+)
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, PlacedMesh, Tour
 from airl_mav.arena.own import generate_own
 from airl_mav.arena.passage import free_share, passage_exists
@@ -36,6 +44,8 @@ class _Stream(IntEnum):
     STATIC = 1
     GOAL = 2
     MOVING = 3
+    GATES = 4
+    HEIGHT = 5
 
 
 @dataclass(frozen=True)
@@ -47,6 +57,13 @@ class _Request:
     counts: tuple[int, int]
     ring_m: tuple[float, float]
     vehicle_width_m: float
+    openings: Openings
+    """Of the gates."""
+
+    @cached_property
+    def frames(self) -> Obstacles:
+        """The boxes of the gates."""
+        return frames(self.openings, self.bounds)
 
     @cached_property
     def start_box(self) -> Boxes:
@@ -77,7 +94,10 @@ def generate(
         raise UsageError(f"vehicle_width_m = {vehicle_width_m:g}: accepted: value > 0 m")
     if spec.generator != OBSTACLES:
         return generate_own(spec, seed, name=name, vehicle_width_m=vehicle_width_m, zone=zone)
+    openings = draw_openings(_rng(seed, _Stream.GATES), spec)
+    _check_openings(openings, name, seed, vehicle_width_m)
     request = _Request(
+        openings=openings,
         spec=spec,
         bounds=local_bounds(spec),
         counts=_draw_counts(spec, seed),
@@ -102,12 +122,14 @@ def generate(
             seed=seed,
             bounds=request.bounds,
             wall_colour=spec.wall_colour,
-            obstacles=_concatenate(static, moving),
+            obstacles=_concatenate(_concatenate(static, request.frames), moving),
             tours=tours,
             goal=goal,
             appearance=spec.appearance,
-            statics=statics,
             meshes=meshes,
+            statics=with_gates(statics, static, len(openings)),
+            goal_height_m=_draw_height(seed, spec),
+            n_gates=len(openings),
         )
     raise UsageError(f"arena {name!r}, seed {seed}: {failure} (best of {LAYOUTS} layouts)")
 
@@ -157,6 +179,27 @@ def _check_fixed_goal(request: _Request, zone: int | None) -> None:
         )
 
 
+def _check_openings(openings: Openings, name: str, seed: int, vehicle_width_m: float) -> None:
+    """Refuse an opening that the vehicle does not fit through, whatever way it leans."""
+    if not len(openings):
+        return
+    least = 2.0 * float(openings.half_size[:, 1:].min())
+    if least <= vehicle_width_m:
+        raise UsageError(
+            f"arena {name!r}, seed {seed}: an opening of a gate is {least:.2f} m wide or high "
+            f"(gates.width_m, gates.height_m); accepted: more than the vehicle's "
+            f"{vehicle_width_m:g} m"
+        )
+
+
+def _draw_height(seed: int, spec: ArenaSpec) -> float | None:
+    """Return the height of the goal [m]; None: it has none."""
+    if spec.goal.height_m is None:
+        return None
+    low, high = spec.goal.height_m
+    return low if low == high else float(_rng(seed, _Stream.HEIGHT).uniform(low, high))
+
+
 def _draw_static(
     rng: np.random.Generator, request: _Request
 ) -> tuple[Obstacles, Boxes, Statics | None, tuple[PlacedMesh, ...]]:
@@ -171,6 +214,8 @@ def _draw_static(
     keep_off = request.start_box
     if spec.goal.fixed is not None:
         keep_off = join(keep_off, _around(np.array(spec.goal.fixed), spec.goal.clearance_m))
+    if len(request.frames):
+        keep_off = join(keep_off, bounding_boxes(request.frames).grown(spec.min_clearance_m))
     try:
         places = place_all(
             rng, bodies.bounding_half, keep_off, request.bounds, spec.min_clearance_m
@@ -195,6 +240,11 @@ def _draw_reachable_goal(
     """Return the fixed goal, or draw a free one, with a way to it."""
     spec, progress = request.spec, len(static)
     keep_off = standing.grown(spec.goal.clearance_m)
+    boxes: Boxes | None = standing
+    if len(request.frames):
+        clearance_m = spec.goal.clearance_m
+        keep_off = join(keep_off, behind(request.openings, request.bounds, clearance_m))
+        static, boxes = _concatenate(static, closed_from_above(request.frames)), None
     for _ in range(GOALS_PER_LAYOUT):
         goal = (
             draw_goal(rng, request.bounds, keep_off, request.ring_m, spec.goal.clearance_m)
@@ -208,7 +258,7 @@ def _draw_reachable_goal(
                 f"goal.clearance_m {spec.goal.clearance_m:g}, among {len(static)} static obstacles",
                 progress,
             )
-        if passage_exists(request.bounds, static, goal, request.vehicle_width_m, standing):
+        if passage_exists(request.bounds, static, goal, request.vehicle_width_m, boxes):
             return goal
     raise NoRoomError(
         f"no way {request.vehicle_width_m:g} m wide from the start to the goal among "
@@ -230,6 +280,8 @@ def _draw_moving(
     spec, (_, n) = request.spec, request.counts
     bodies = draw_bodies(rng, n, spec.moving, spec.flight_altitude_m)
     gap, walking_gap = spec.min_clearance_m, spec.moving.clearance_m
+    if len(request.frames):
+        standing = join(standing, bounding_boxes(request.frames))
     on_the_way = join(request.start_box, standing.grown(walking_gap))
     at_first = on_the_way
     if gap > walking_gap:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.appearance import Drawn, Statics, draw_appearance
 from airl_mav.core.constants import US_PER_S
+from airl_mav.core.goals import Goal
 from airl_mav.profiles.appearance import DEFAULT, Appearance
 from airl_mav.profiles.mesh_file import MeshFile
 
@@ -105,6 +106,16 @@ class Arena:
     """None: every primitive that stands is a thing of its own."""
     meshes: tuple[PlacedMesh, ...] = ()
     """Those that cameras see, in the order of their obstacles, all of which stand still."""
+    goal_height_m: float | None = None
+    """Of the goal, above the floor; None: it has none, and is reached at any height."""
+    n_gates: int = 0
+    """The boxes of so many gates are the last of those obstacles that stand (`arena.gates`)."""
+
+    @property
+    def goal_point(self) -> Goal:
+        """The goal as flights are told of it."""
+        north, east = self.goal.tolist()
+        return (north, east) if self.goal_height_m is None else (north, east, -self.goal_height_m)
 
     @cached_property
     def look(self) -> Drawn:

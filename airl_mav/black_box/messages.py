@@ -56,7 +56,7 @@ class Decision:
     quaternion: Vector4
     """w, x, y, z, body to world."""
     goal_away_m: Number
-    """Distance to the goal, seen from above [m]."""
+    """Distance to the goal: seen from above, if it has no height [m]."""
     setpoint: Vector4
     """Forward, right, down [m/s] and yaw rate [rad/s], in the heading frame."""
 

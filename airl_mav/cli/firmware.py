@@ -10,6 +10,7 @@ from rich.console import Console
 from airl_mav.cli.options import run_command
 from airl_mav.core.console import new_console
 from airl_mav.core.errors import EXIT_BROKEN
+from airl_mav.core.goals import Goal
 from airl_mav.lockstep.remote import fly_vehicle_in_lockstep
 from airl_mav.lockstep.turns import LockstepError
 from airl_mav.rehearsal.stand_alone import Listener, fly_vehicle
@@ -55,7 +56,7 @@ def _listener(options: FirmwareOptions, console: Console) -> Listener:
     def say(line: str) -> None:
         console.print(line, highlight=False)
 
-    def ready(camera: str, goal: tuple[float, float]) -> None:
+    def ready(camera: str, goal: Goal) -> None:
         say(f"MAVSDK            udpin://{options.companion_host}:{options.companion_port}")
         if not options.lockstep:
             say(f"QGroundControl    UDP port {options.ports.gcs_port} (connects by itself)")
@@ -69,8 +70,8 @@ def _listener(options: FirmwareOptions, console: Console) -> Listener:
         if options.firmware != "builtin":
             say(f"firmware          {FIRMWARE_TITLES[options.firmware]}")
         # In lockstep the last digit counts.
-        north, east = (repr(m) if options.lockstep else f"{m:.1f}" for m in goal)
-        say(f"goal              {north} {east} (north east, m)")
+        metres = " ".join(repr(m) if options.lockstep else f"{m:.1f}" for m in goal)
+        say(f"goal              {metres} (north east{' down' if len(goal) == 3 else ''}, m)")
         if options.lockstep:
             say("waiting for a companion that passes turns. Ctrl-C ends it.")
         else:

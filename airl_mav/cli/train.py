@@ -99,7 +99,9 @@ def run(
         lines = (f"best       {rate} after {best.steps:,} decisions", f"policy     {policy}")
         for line in lines:
             show(line)
-        show(f"fly it     airl-sitl --policy {policy}")
+        environment = config.environment
+        where = f" --arena {environment.arena}" if environment.goal_height else ""
+        show(f"fly it     airl-sitl --policy {policy}{where}")
         progress.tell(Exported(str(policy)))
         voice.finish(0, "complete", out, more=lines)
     return 0

@@ -28,7 +28,7 @@ class ArenaBatch(NamedTuple):
     tour_points: NDArray[np.float64]  # (n, movers, k, 2)
     tour_period_s: NDArray[np.float64]  # (n, movers)
     tour_speed: NDArray[np.float64]  # (n,) greatest speed of any mover [m/s]
-    goal: NDArray[np.float64]  # (n, 2) north, east [m]
+    goal: NDArray[np.float64]  # (n, 3) north, east, down [m]; down is NaN where it has no height
 
 
 def empty_batch(n: int, obstacles: int, movers: int, points: int) -> ArenaBatch:
@@ -45,7 +45,7 @@ def empty_batch(n: int, obstacles: int, movers: int, points: int) -> ArenaBatch:
         tour_points=np.zeros((n, movers, points, 2)),
         tour_period_s=np.ones((n, movers)),
         tour_speed=np.zeros(n),
-        goal=np.zeros((n, 2)),
+        goal=np.tile((0.0, 0.0, math.nan), (n, 1)),
     )
 
 
@@ -97,7 +97,9 @@ def put_arena(batch: ArenaBatch, i: int, arena: Arena) -> None:
     batch.center[i, :count] = o.center
     batch.half_size[i, :count] = o.half_size
     batch.yaw[i, :count] = o.yaw
-    batch.goal[i] = arena.goal
+    height_m = arena.goal_height_m
+    batch.goal[i, :2] = arena.goal
+    batch.goal[i, 2] = math.nan if height_m is None else -height_m
     batch.tour_times_s[i] = np.inf
     batch.tour_speed[i] = 0.0
     for j, tour in enumerate(arena.tours):

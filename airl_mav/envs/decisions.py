@@ -16,7 +16,7 @@ from airl_mav.envs.fleet import Verdict
 from airl_mav.envs.navigation import Flights, Navigation
 from airl_mav.envs.rewards import Step, costs, reward_of
 from airl_mav.envs.spec import Costs, EnvironmentSpec, gymnasium_spec
-from airl_mav.policy.action_sets import ActionSpec, commands, discrete_actions
+from airl_mav.policy.action_sets import ActionSpec, commands, continuous_numbers, discrete_actions
 from airl_mav.policy.layouts import boxes
 from airl_mav.policy.observation_spec import ObservationSpec
 
@@ -87,7 +87,8 @@ class Decisions:
             raise gym.error.ResetNeeded("step() before reset()")
         chosen = commands(spec.action_spec, actions)
         charged = spec.costs != _FREE
-        last = self.navigation.whole_truth().fleet.setpoint[:, (0, 1, 3)] if charged else chosen
+        level = chosen[:, :3]
+        last = self.navigation.whole_truth().fleet.setpoint[:, (0, 1, 3)] if charged else level
         self.navigation.fly(chosen)
         now = self._before = self.navigation.flights()
         truncated: NDArray[np.bool_] = now.verdict == Verdict.TIMEOUT
@@ -96,7 +97,7 @@ class Decisions:
             for i in np.flatnonzero(terminated | truncated):
                 success = bool(now.verdict[i] == Verdict.SUCCESS)
                 self.curriculum.record(int(self.navigation.zones[i]), success=success)
-        step = Step(before, now, chosen, spec.episode.hold_s)
+        step = Step(before, now, level, spec.episode.hold_s)
         reward = self._reward(step)
         if charged:
             reward = reward - costs(spec.costs, last, step)
@@ -132,11 +133,14 @@ def observation_space(spec: ObservationSpec) -> gym.spaces.Dict:
 
 
 def action_space(spec: ActionSpec) -> gym.Space[Any]:
-    """Return Discrete(25), or Box(-1, 1, (2,)) of the continuous set."""
+    """Return Discrete(25) and the like, or Box(-1, 1, (2,)) of a continuous set.
+
+    Where the actions have a vertical speed, the box is (3,).
+    """
     number = discrete_actions(spec)
     if number is not None:
         return gym.spaces.Discrete(number)
-    return gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
+    return gym.spaces.Box(-1.0, 1.0, (continuous_numbers(spec),), np.float32)
 
 
 def zone_option(options: Mapping[str, Any] | None) -> int | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -14,7 +15,7 @@ from airl_mav.envs.fleet import Verdict
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.flight.judge import Outcome
-from airl_mav.policy.action_sets import commands
+from airl_mav.policy.action_sets import commands, commands_vertical_speed
 from airl_mav.policy.actions import Policy, limited
 from airl_mav.policy.layouts import encode_layout
 from airl_mav.policy.learned import LearnedPolicy
@@ -56,7 +57,7 @@ class Pilots(Protocol):
         ...
 
     def decide(self, seen: Observation, flying: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """Return the velocity commands (n, 3) as `action_sets.commands` does.
+        """Return the velocity commands (n, 3), or (n, 4), as `Navigation.fly` takes them.
 
         Args:
             seen: The observations of n vehicles.
@@ -93,7 +94,8 @@ class LearnedPilots:
         try:
             if not self._alone:
                 return commands(card.actions, self._policy.act_batch(encoded))
-            chosen = np.zeros((len(flying), 3))
+            columns = 4 if commands_vertical_speed(card.actions) else 3
+            chosen = np.zeros((len(flying), columns))
             for i in np.flatnonzero(flying):
                 row = {key: array[i : i + 1] for key, array in encoded.items()}
                 chosen[i] = commands(card.actions, self._own[int(i)].act_batch(row))[0]
@@ -117,11 +119,13 @@ class SinglePilots:
 
     def decide(self, seen: Observation, flying: NDArray[np.bool_]) -> NDArray[np.float64]:
         """Return the commands; see `Pilots`."""
-        chosen = np.zeros((len(flying), 3))
+        chosen = np.tile((0.0, 0.0, 0.0, math.nan), (len(flying), 1))
         for i in np.flatnonzero(flying):
             action = limited(self._policies[int(i)].act(seen.rows(int(i))), self._max_speed_m_s)
-            chosen[i] = action.forward_m_s, action.right_m_s, action.yaw_rate_rad_s
-        return chosen
+            chosen[i, :3] = action.forward_m_s, action.right_m_s, action.yaw_rate_rad_s
+            if action.down_m_s is not None:
+                chosen[i, 3] = action.down_m_s
+        return chosen[:, :3] if np.isnan(chosen[:, 3]).all() else chosen
 
 
 class _EncodedPilots:

@@ -1,7 +1,8 @@
 """Experts: who is imitated. Each decides for the flights of a batch twin, in its action set.
 
-`greedy` is the classical baseline: it sees what a policy sees. `planner` knows the true arena. An
-expert chooses among commands of the action set: all of a discrete set, a fan of directions and
+`greedy` is the classical baseline: it sees what a policy sees. `planner` knows the true arena,
+`gates` the openings of its gates, for which it decides by itself (`gate_pilot`). Another expert
+chooses among commands of the action set: all of a discrete set, a fan of directions and
 speeds of the continuous one.
 """
 
@@ -15,11 +16,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.core.errors import FieldError
+from airl_mav.envs.gate_pilot import GatePilot
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.planner import Planner
 from airl_mav.envs.saved_state import State, Stateful
 from airl_mav.envs.spec import ExpertName
-from airl_mav.policy.action_sets import CONTINUOUS, ActionSpec, commands, discrete_actions
+from airl_mav.policy.action_sets import (
+    CONTINUOUS,
+    VERTICAL,
+    ActionSpec,
+    commands,
+    discrete_actions,
+)
 from airl_mav.policy.greedy import GreedyPolicy, GreedySettings
 
 DIRECTIONS = 48
@@ -44,6 +52,9 @@ class Choices(NamedTuple):
 def choices(spec: ActionSpec) -> Choices:
     """Return the actions that an expert chooses from."""
     count = discrete_actions(spec)
+    if spec.set in VERTICAL:
+        accepted = "one without a vertical speed; with one, expert gates"
+        raise FieldError("environment.actions", spec.set, accepted)
     if count is None and spec.set not in CONTINUOUS:
         accepted = f"a discrete action set, or {' or '.join(map(repr, CONTINUOUS))}"
         raise FieldError("environment.actions", spec.set, accepted)
@@ -106,9 +117,14 @@ class Expert(Stateful):
     def __init__(self, name: ExpertName, navigation: Navigation) -> None:
         """Take an expert by name, for the flights of a batch twin."""
         self._navigation = navigation
-        self._choices = choices(navigation.spec.action_spec)
-        kind = Planner if name == "planner" else GreedyPilots
-        self._chooser: Planner | GreedyPilots = kind(navigation, self._choices.commands)
+        self._chooser: Planner | GreedyPilots | GatePilot
+        self._choices: Choices | None = None
+        if name == "gates":
+            self._chooser = GatePilot(navigation)
+        else:
+            self._choices = choices(navigation.spec.action_spec)
+            kind = Planner if name == "planner" else GreedyPilots
+            self._chooser = kind(navigation, self._choices.commands)
         self._begun = np.zeros(navigation.n, np.bool_)
         self._sides = np.ones(navigation.n)
 
@@ -119,7 +135,8 @@ class Expert(Stateful):
 
     def decide(self) -> NDArray[Any]:
         """Return the actions of n vehicles in their present states, as a policy gives them."""
-        return self._choices.actions[self._chooser.decide()]
+        decided = self._chooser.decide()
+        return decided if self._choices is None else self._choices.actions[decided]
 
     def _held(self) -> Mapping[str, Any]:
         if isinstance(self._chooser, GreedyPilots):

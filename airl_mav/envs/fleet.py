@@ -40,7 +40,7 @@ class Rules(NamedTuple):
     """What ends a flight besides collision and battery; as `flight.judge.Task`."""
 
     goal_radius: float
-    """The goal is reached closer than this, seen from above [m]."""
+    """The goal is reached closer than this: seen from above, if it has no height [m]."""
     time_limit_us: int
     """Longest flight [µs]."""
 

@@ -159,7 +159,7 @@ def advance(
                 if fleet.room[i] < _ROUNDING_M:
                     fleet.room[i], hit = _contact(arenas, i, here, fleet.time_us[i], vehicle)
                 fleet.touched[i] = hit
-                goal = arenas.goal[i, 0], arenas.goal[i, 1]
+                goal = arenas.goal[i, 0], arenas.goal[i, 1], arenas.goal[i, 2]
                 fleet.verdict[i] = _verdict(
                     here, goal, hit, state[BATTERY, j], fleet.time_us[i], rules
                 )
@@ -398,12 +398,13 @@ def _move(state: State, vehicle: Vehicle, kept: float) -> None:
 
 
 @kernel
-def _verdict(
-    here: Vec, goal: tuple[float, float], hit: int, battery: float, time_us: int, rules: Rules
-) -> int:
+def _verdict(here: Vec, goal: Vec, hit: int, battery: float, time_us: int, rules: Rules) -> int:
     """Return what a tick has decided, FLYING mostly."""
     # Never given the whole fleet: counting the references to its arrays takes longer than a tick.
-    if (here[0] - goal[0]) ** 2 + (here[1] - goal[1]) ** 2 < rules.goal_radius**2:
+    away = (here[0] - goal[0]) ** 2 + (here[1] - goal[1]) ** 2
+    if not math.isnan(goal[2]):
+        away += (here[2] - goal[2]) ** 2
+    if away < rules.goal_radius**2:
         return _SUCCESS
     if hit != NOTHING:
         return _COLLISION

@@ -8,6 +8,7 @@ as well. Everything is in ticks of simulated time, so nothing depends on the mac
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from airl_mav.camera.conditions import check_noise
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.constants import TICK_US, US_PER_MS, US_PER_S
-from airl_mav.core.errors import UsageError
+from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.streams import Stream, stream
 from airl_mav.envs.arenas import ArenaBatch, move_all_obstacles
 from airl_mav.envs.cameras import Cameras
@@ -55,7 +56,7 @@ from airl_mav.policy.layouts import encode_layout
 from airl_mav.policy.observation import Kinematics, Observation, Rows, observe
 from airl_mav.policy.observation_spec import Encoded, ObservationSpec, camera_mismatch
 from airl_mav.prediction.compensator import Compensator
-from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.profiles.arena import OBSTACLES, ArenaSpec
 from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.conditions import Payload
 from airl_mav.profiles.loaded import check_spread, equipped
@@ -79,7 +80,7 @@ class Flights:
     """Flown so far [m]."""
     energy_j: NDArray[np.float64]
     goal_distance_m: NDArray[np.float64]
-    """Horizontal, true."""
+    """True; seen from above, where the goal has no height."""
     speed_m_s: NDArray[np.float64]
     """Three-dimensional, true."""
     battery: NDArray[np.float64]
@@ -163,7 +164,15 @@ class Navigation(Stateful):
             kind=self.camera.kind,
             frames=spec.frames,
             in_flight=spec.in_flight,
+            goal_height=spec.goal_height,
         )
+        known = self.arena_spec.generator == OBSTACLES
+        if spec.goal_height and known and self.arena_spec.goal.height_m is None:
+            raise FieldError(
+                "goal_height",
+                True,
+                f"false in arena {spec.arena!r}, whose profile has no goal.height_m",
+            )
         self.intrinsics: Intrinsics = Intrinsics.of(self.camera)
         if problem := camera_mismatch(self.observation, self.intrinsics):
             raise UsageError(f"image_width_px, image_height_px: {problem}")
@@ -295,6 +304,8 @@ class Navigation(Stateful):
         else:
             image, state = self.cameras.image[rows], self.kinematics(rows)
         goal = self._places.batch.goal[rows]
+        if np.isnan(goal[:, 2]).all():
+            goal = goal[:, :2]
         return observe(image, self.intrinsics, state, goal, known.told(rows), known.earlier(rows))
 
     def observe(self, slots: Sequence[int] | None = None) -> Encoded:
@@ -311,13 +322,14 @@ class Navigation(Stateful):
     def flights(self, rows: Rows = EVERYONE) -> Flights:
         """Return the status of all flights, or of those in `rows`; copies."""
         fleet = self.fleet
-        to_goal = self._places.batch.goal[rows] - fleet.position[rows, :2]
+        to_goal = self._places.batch.goal[rows] - fleet.position[rows]
+        away, below = np.hypot(to_goal[:, 0], to_goal[:, 1]), to_goal[:, 2]
         return Flights(
             verdict=np.array(fleet.verdict[rows]),
             time_s=fleet.time_us[rows] / US_PER_S,
             distance_m=np.array(fleet.distance[rows]),
             energy_j=np.array(fleet.energy[rows]),
-            goal_distance_m=np.hypot(to_goal[:, 0], to_goal[:, 1]),
+            goal_distance_m=np.where(np.isnan(below), away, np.hypot(away, below)),
             speed_m_s=np.linalg.norm(fleet.velocity[rows], axis=1),
             battery=np.array(fleet.battery[rows]),
             touched=np.array(fleet.touched[rows]),
@@ -337,14 +349,18 @@ class Navigation(Stateful):
         """Fly one decision of every flight that has not ended.
 
         Args:
-            commands: (n, 3) forward, right [m/s], yaw rate [rad/s].
+            commands: (n, 3) forward, right [m/s], yaw rate [rad/s]: an altitude is held; or
+                (n, 4): behind them the downward speed [m/s], NaN where the altitude is held.
 
         Raises:
             ValueError: Not n commands.
         """
-        if commands.shape != (self.n, 3):
-            raise ValueError(f"commands of shape {commands.shape}: accepted: ({self.n}, 3)")
-        setpoints = np.insert(commands, 2, 0.0, axis=1)
+        if commands.ndim != 2 or len(commands) != self.n or commands.shape[1] not in (3, 4):
+            accepted = f"({self.n}, 3) or ({self.n}, 4)"
+            raise ValueError(f"commands of shape {commands.shape}: accepted: {accepted}")
+        # NaN: decided when it is sent.
+        down = commands[:, 3] if commands.shape[1] == 4 else math.nan
+        setpoints = np.insert(commands[:, :3], 2, down, axis=1)
         if self._trace is not None:
             self._trace.deciding(self.fleet)
         began_us = self.fleet.time_us.copy()

@@ -63,11 +63,11 @@ def noticed_m(policy: LearnedPolicy, vehicle: VehicleProfile) -> NDArray[np.floa
         arenas.center[:-1, 0, 0] = camera.forward_m + depths + half_m
         arenas.center[:-1, 0, 1] = aside * half_m
         arenas.center[:-1, 0, 2] = -HALF_HEIGHT_M
-        arenas.goal[:] = (away_m * math.cos(bearing), away_m * math.sin(bearing))
+        arenas.goal[:, :2] = (away_m * math.cos(bearing), away_m * math.sin(bearing))
         cameras.capture(fleet, arenas, np.ones(n, np.bool_), np.zeros(n, np.int64))
         state = Kinematics(fleet.position, fleet.velocity, fleet.quaternion)
         seen = observe(
-            *(cameras.image, Intrinsics.of(camera), state, arenas.goal),
+            *(cameras.image, Intrinsics.of(camera), state, arenas.goal[:, :2]),
             InFlight.of_first_decisions(n),
         )
         # As at the first decision of a flight, where the policy has a memory.

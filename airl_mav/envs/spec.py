@@ -13,7 +13,7 @@ from airl_mav.core.plugins import REWARDS, part_name
 from airl_mav.flight.judge import GOAL_RADIUS_M, TIME_LIMIT_S, GoalRadius, TimeLimit
 from airl_mav.policy.action_sets import PAPER_SPEED_M_S, ActionSetName, ActionSpec
 from airl_mav.policy.actions import DecisionTiming
-from airl_mav.policy.observation_spec import STRIP_ROWS, Frames, LayoutName, Told
+from airl_mav.policy.observation_spec import STRIP_ROWS, Frames, GoalHeight, LayoutName, Told
 from airl_mav.profiles.camera import Camera, check_matched
 from airl_mav.profiles.camera_kind import CameraKind
 from airl_mav.profiles.conditions import SensorNoise, Spread, WindSettings
@@ -26,7 +26,7 @@ SHIPPED_REWARDS = ("shaped", "timed", "paper-scaled", "paper")
 RewardName = Annotated[str, part_name(REWARDS, SHIPPED_REWARDS)]
 
 
-ExpertName = Literal["greedy", "planner"]
+ExpertName = Literal["greedy", "planner", "gates"]
 """See `envs.experts`."""
 
 
@@ -50,7 +50,13 @@ class EpisodeRules(ProfileModel):
         le=60,
         default=None,
     )
-    altitude_m: float = quantity("height that is held", "m", ge=0.5, le=100, default=2.5)
+    altitude_m: float = quantity(
+        "height that is held; with a vertical speed in the actions: that it begins at",
+        "m",
+        ge=0.5,
+        le=100,
+        default=2.5,
+    )
 
 
 class CameraChange(ProfileModel):
@@ -232,10 +238,12 @@ class EnvironmentSpec(ProfileModel):
     in_flight: tuple[Told, ...] = Field(
         default=(), description="what else the network is told: command, latency, age"
     )
+    goal_height: GoalHeight = False
     actions: ActionSetName = Field(
         default="arc-25",
-        description="action set: arc-25, paper-25, velocity, velocity-fixed-yaw, or your own as"
-        " MODULE:NAME or FILE.py:NAME",
+        description="action set: arc-25, paper-25, velocity, velocity-fixed-yaw; with a vertical"
+        " speed arc3d-75, velocity3d, velocity3d-fixed-yaw; or your own as MODULE:NAME or"
+        " FILE.py:NAME",
     )
     max_speed_m_s: float = quantity("fastest action", "m/s", gt=0, le=30, default=PAPER_SPEED_M_S)
     reward: RewardName = Field(
@@ -287,6 +295,12 @@ class EnvironmentSpec(ProfileModel):
                 "decisions = 'pipelined': with episode.hover_after_s: accepted: one of them, as no"
                 " hold ends"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _told_of_heights(self) -> EnvironmentSpec:
+        if self.goal_height and self.layout == "paper":
+            raise ValueError("goal_height = true: accepted: false with layout 'paper'")
         return self
 
     @property

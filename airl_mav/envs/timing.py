@@ -72,8 +72,8 @@ class Timing(Protocol):
 
         Args:
             vehicles: What flies.
-            setpoints: (n, 4) forward, right, down [m/s], yaw rate [rad/s]; the third, which is
-                decided when it is sent, is written.
+            setpoints: (n, 4) forward, right, down [m/s], yaw rate [rad/s]; the third, where it is
+                NaN, is written when it is sent: it then holds the altitude.
             t2_us: (n,) time of the inference.
 
         Returns:
@@ -130,7 +130,7 @@ class SequentialTiming(Stateful):
         sent, accepted = ticks_of(t2_us), ticks_of(arrives_us)
         stop = self._stop(fleet.time_us)
         self._wait(vehicles, np.zeros_like(sent), sent, stop)
-        setpoints[:, 2] = vehicles.holding_altitude()
+        _hold_altitude(vehicles, setpoints, np.ones(len(sent), np.bool_))
         left, link = sent + self._hold_us // TICK_US - accepted, accepted - sent
         arrives_us = fleet.time_us + link * TICK_US
         age = self._age(vehicles, arrives_us, left)
@@ -228,7 +228,7 @@ class PipelinedTiming(Stateful):
             if captured.any():
                 vehicles.capture(captured)
             if decided.any():
-                setpoints[decided, 2] = vehicles.holding_altitude()[decided]
+                _hold_altitude(vehicles, setpoints, decided)
             give(fleet, setpoints, (event == room + 2) & real)
         vehicles.advance(ended - now)
         self._left[:, 1:] = np.maximum(self._left[:, :-1] - ended[:, None], 0)
@@ -240,6 +240,15 @@ class PipelinedTiming(Stateful):
 
     def _held(self) -> Mapping[str, Any]:
         return {"left": self._left, "in_flight": self._in_flight}
+
+
+def _hold_altitude(
+    vehicles: Vehicles, setpoints: NDArray[np.float64], who: NDArray[np.bool_]
+) -> None:
+    """Write the downward speeds of those in `who` (n,) whose actions say nothing of them."""
+    silent = who & np.isnan(setpoints[:, 2])
+    if silent.any():
+        setpoints[silent, 2] = vehicles.holding_altitude()[silent]
 
 
 def give(fleet: Fleet, setpoints: NDArray[np.float64], who: NDArray[np.bool_]) -> None:

@@ -173,7 +173,7 @@ class GymFlier:
             zone=self.scenario.scenario.zone,
             outcome=outcome,
             reason=_reason(outcome, flights, slot, arena, rules.time_limit_s),
-            goal=(float(arena.goal[0]), float(arena.goal[1])),
+            goal=arena.goal_point,
             goal_radius_m=rules.goal_radius_m,
             time_limit_s=rules.time_limit_s,
             # The twin begins in a hover above the start: there is no take-off.

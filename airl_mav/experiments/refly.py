@@ -18,12 +18,13 @@ from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import validated
 from airl_mav.core.files import replace_file
 from airl_mav.core.frames import quat_yaw
+from airl_mav.core.goals import Goal, goal_height_m
 from airl_mav.core.plugins import names_code
 from airl_mav.experiments.fly import rehearse
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.statistics import successful
 from airl_mav.flight.trajectory import Trajectory
-from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.profiles.arena import ArenaSpec, Size
 from airl_mav.profiles.conditions import WindSettings
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder, RunInfo
 from airl_mav.report.recorded_flight import episode_of, info_of, settings_of
@@ -199,7 +200,8 @@ def from_its_start(episode: FlownEpisode) -> FlownEpisode:
     path, record = episode.trajectory, episode.record
     origin = path.position[_begun(episode)] * (1.0, 1.0, 0.0)
     turn = Rotation.from_euler("z", -_first_yaw(episode))
-    goal = turn.apply(np.array([*record.goal, 0.0]) - origin)
+    north, east, *down = record.goal
+    goal = turn.apply(np.array([north, east, 0.0]) - origin)
     attitude = turn * Rotation.from_quat(path.quaternion, scalar_first=True)
     moved = replace(
         path,
@@ -207,9 +209,10 @@ def from_its_start(episode: FlownEpisode) -> FlownEpisode:
         velocity=turn.apply(path.velocity),
         quaternion=attitude.as_quat(scalar_first=True),
     )
-    return replace(
-        episode, trajectory=moved, record=replace(record, goal=(float(goal[0]), float(goal[1])))
-    )
+    turned: Goal = (float(goal[0]), float(goal[1]))
+    if down:
+        turned = (*turned[:2], down[0])
+    return replace(episode, trajectory=moved, record=replace(record, goal=turned))
 
 
 def turned_wind(wind: WindSettings, angle_rad: float) -> WindSettings:
@@ -263,11 +266,12 @@ def _write_latencies(episode: FlownEpisode, path: Path) -> None:
 
 def _plain(episode: FlownEpisode, path: Path) -> str:
     """Write the profile of an empty arena around a flight, and return its path."""
-    here = np.vstack([episode.trajectory.position[:, :2], [0.0, 0.0], episode.record.goal])
+    here = np.vstack([episode.trajectory.position[:, :2], [0.0, 0.0], episode.record.goal[:2]])
     low, high = here.min(axis=0) - CLEAR_M, here.max(axis=0) + CLEAR_M
     (north, east), (start_north, start_east) = high - low, -low
-    goal_north, goal_east = episode.record.goal
-    profile = {
+    goal_north, goal_east = episode.record.goal[:2]
+    goal_up = goal_height_m(episode.record.goal)
+    profile: dict[str, Any] = {
         "description": "an empty plain",
         "zones_m": [float(max(np.hypot(north, east), 1.0))],
         "size": {"north_m": float(north), "east_m": float(east)},
@@ -275,6 +279,9 @@ def _plain(episode: FlownEpisode, path: Path) -> str:
         "goal": {"north_m": goal_north, "east_m": goal_east},
         "static": {"count": [0, 0]},
     }
+    if goal_up is not None:
+        profile["goal"] |= {"height_m": goal_up}
+        profile["size"] |= {"height_m": max(Size().height_m, goal_up)}
     try:
         ArenaSpec.model_validate(profile)
     except ValueError:

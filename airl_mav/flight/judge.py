@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from enum import Enum
 from typing import Annotated, NamedTuple
 
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.fields import quantity
+from airl_mav.core.goals import Goal, goal_distance_m
 
 GOAL_RADIUS_M = 3.0
 """Default goal radius [m]: that of the paper's code, seen from above."""
@@ -18,7 +18,13 @@ TIME_LIMIT_S = 120.0
 slowest policies took 48 s on average."""
 
 GoalRadius = Annotated[
-    float, quantity("the goal is reached closer than this, seen from above", "m", ge=0.2, le=50)
+    float,
+    quantity(
+        "the goal is reached closer than this: seen from above, without a height",
+        "m",
+        ge=0.2,
+        le=50,
+    ),
 ]
 TimeLimit = Annotated[
     float, quantity("longest flight from the start of navigation", "s", ge=1, le=3600)
@@ -39,10 +45,10 @@ class Outcome(str, Enum):
 class Task:
     """What a flight has to do."""
 
-    goal: tuple[float, float]
-    """North, east [m]."""
+    goal: Goal
+    """North, east [m], and down where it has a height."""
     goal_radius_m: float
-    """The goal is reached closer than this, seen from above [m]."""
+    """The goal is reached closer than this: seen from above, if it has no height [m]."""
     time_limit_s: float
     """Longest time from the start of navigation [s]."""
 
@@ -114,9 +120,7 @@ class Referee:
         task = self.task
         flying = self.navigation_us is not None and sample.time_us >= self.navigation_us
         if flying:
-            distance = math.hypot(
-                sample.position[0] - task.goal[0], sample.position[1] - task.goal[1]
-            )
+            distance = goal_distance_m(task.goal, sample.position)
             if distance < task.goal_radius_m:
                 return Outcome.SUCCESS, f"{distance:.2f} m from the goal"
         if sample.collision is not None:

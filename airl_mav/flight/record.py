@@ -10,6 +10,7 @@ from typing import Any
 from pydantic import TypeAdapter
 
 from airl_mav.core.files import typed
+from airl_mav.core.goals import Goal
 from airl_mav.core.process_use import ProcessUse
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.quality import Quality
@@ -46,7 +47,7 @@ class EpisodeRecord:
     arena_seed: int
     outcome: Outcome
     reason: str
-    goal: tuple[float, float]
+    goal: Goal
     """North, east [m]."""
     goal_radius_m: float
     time_limit_s: float

@@ -152,7 +152,7 @@ class _Flight:
         self._observer = observer
         self._ticks = 0
         self._arena = resolved.arena_of(seed)
-        self._goal = (float(self._arena.goal[0]), float(self._arena.goal[1]))
+        self._goal = self._arena.goal_point
         self._witnessed = resolved.scenario.firmware == "builtin"
         self._digest = FlightDigest() if self._witnessed else Unwitnessed()
         self._stop = threading.Event()

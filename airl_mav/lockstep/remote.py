@@ -99,8 +99,7 @@ class RemoteStage:
         asked = self._asked
         loaded = self.firmware.load(setup, tlog, BOOT_UNIX_US)
         if asked.goal_radius_m is not None and setup.arena is not None:
-            goal = (float(setup.arena.goal[0]), float(setup.arena.goal[1]))
-            task = Task(goal, asked.goal_radius_m, asked.time_limit_s)
+            task = Task(setup.arena.goal_point, asked.goal_radius_m, asked.time_limit_s)
             supervisor = Supervisor(Referee(task), loaded.time_us)
             self._judge = Judge(
                 supervisor, self._digest, order=self._partner.order, judged=self._decide

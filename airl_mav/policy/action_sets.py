@@ -2,7 +2,10 @@
 
 `arc-25`: five speeds with five yaw rates. `paper-25`: the 25 actions of the paper's text.
 `velocity`: the paper's continuous pair, forward and right speed, the nose following;
-`velocity-fixed-yaw`: the same pair, the nose staying where it is. Any other is the user's own: a
+`velocity-fixed-yaw`: the same pair, the nose staying where it is. Those of three dimensions also
+command how fast the vehicle sinks or climbs, where the others hold an altitude: `velocity3d` and
+`velocity3d-fixed-yaw`, as these two with a third number, and `arc3d-75`: `arc-25` climbing, level
+and sinking. Any other is the user's own: a
 class, made without arguments, whose objects are an `ActionSet`.
 """
 
@@ -18,10 +21,17 @@ from numpy.typing import NDArray
 from airl_mav.core import plugins
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import ProfileModel, quantity
-from airl_mav.policy.actions import Action
+from airl_mav.policy.actions import Action, fastest_climb
 
-CONTINUOUS = ("velocity", "velocity-fixed-yaw")
-SHIPPED = ("arc-25", "paper-25", *CONTINUOUS)
+FIXED_YAW = ("velocity-fixed-yaw", "velocity3d-fixed-yaw")
+CONTINUOUS = ("velocity", "velocity3d", *FIXED_YAW)
+VERTICAL = ("arc3d-75", "velocity3d", "velocity3d-fixed-yaw")
+"""The sets that command a vertical speed, too."""
+
+DISCRETE = {"arc-25": 25, "paper-25": 25, "arc3d-75": 75}
+"""Numbers of actions."""
+
+SHIPPED = ("arc-25", "paper-25", "velocity", "velocity-fixed-yaw", *VERTICAL)
 ActionSetName = Annotated[str, plugins.part_name(plugins.ACTION_SETS, SHIPPED)]
 
 PAPER_SPEED_M_S = 5.0
@@ -32,6 +42,9 @@ ARC_SPEEDS = (0.0, 0.2, 0.4, 0.7, 1.0)
 
 ARC_YAW_RATES_DEG_S = (-72.0, -27.0, 0.0, 27.0, 72.0)
 """`arc-25`: yaw rates [deg/s]."""
+
+CLIMB_SHARES = (-1.0, 0.0, 1.0)
+"""`arc3d-75`: downward speeds as shares of the fastest climb."""
 
 PAPER_RIGHT_DEG_S = (108.0, 54.0, 27.0, 13.5, 6.75)
 PAPER_LEFT_DEG_S = (-216.0, -108.0, -54.0, -27.0, -13.5)
@@ -70,7 +83,17 @@ def discrete_actions(spec: ActionSpec) -> int | None:
     """Return the number of discrete actions; None for a continuous set."""
     if spec.set not in SHIPPED:
         return _own(spec.set).discrete
-    return None if spec.set in CONTINUOUS else 25
+    return DISCRETE.get(spec.set)
+
+
+def continuous_numbers(spec: ActionSpec) -> int:
+    """Return how many numbers an action of a continuous set has."""
+    return 3 if spec.set in VERTICAL else 2
+
+
+def commands_vertical_speed(spec: ActionSpec) -> bool:
+    """Return whether an action set says how fast to sink or climb; else an altitude is held."""
+    return spec.set in VERTICAL
 
 
 def commands(spec: ActionSpec, actions: NDArray[Any]) -> NDArray[np.float64]:
@@ -80,10 +103,12 @@ def commands(spec: ActionSpec, actions: NDArray[Any]) -> NDArray[np.float64]:
         spec: The action set.
         actions: (n,) whole numbers, from 0 on, of a discrete set; (n, 2) numbers of a continuous
             one: of those shipped, forward and right speed, each -1..1 of the fastest; anything
-            beyond is cut off.
+            beyond is cut off. Of a set of three dimensions (n, 3): also the downward speed, of
+            the fastest climb (`actions.fastest_climb`).
 
     Returns:
-        (n, 3) forward and right [m/s] in the heading frame, yaw rate [rad/s], clockwise positive.
+        (n, 3) forward and right [m/s] in the heading frame, yaw rate [rad/s], clockwise positive;
+        of a set of three dimensions (n, 4): behind them the downward speed [m/s].
 
     Raises:
         UsageError: A set of the user's gives anything else.
@@ -93,17 +118,19 @@ def commands(spec: ActionSpec, actions: NDArray[Any]) -> NDArray[np.float64]:
     if spec.set not in CONTINUOUS:
         chosen: NDArray[np.float64] = _table(spec.set, spec.max_speed_m_s)[np.asarray(actions)]
         return chosen
-    wanted = np.clip(np.asarray(actions, np.float64), -1.0, 1.0) * spec.max_speed_m_s
+    shares = np.clip(np.asarray(actions, np.float64), -1.0, 1.0)
+    wanted = shares[:, :2] * spec.max_speed_m_s
     # A vector, not a pair: the corner of the square is no faster than its edges.
     speed = np.hypot(wanted[:, 0], wanted[:, 1])
     wanted *= np.minimum(1.0, spec.max_speed_m_s / np.maximum(speed, 1e-9))[:, None]
-    if spec.set == "velocity-fixed-yaw":
-        return np.concatenate([wanted, np.zeros((len(wanted), 1))], axis=1)
+    down = shares[:, 2:] * fastest_climb(spec.max_speed_m_s)
+    if spec.set in FIXED_YAW:
+        return np.concatenate([wanted, np.zeros((len(wanted), 1)), down], axis=1)
     course = np.arctan2(wanted[:, 1], wanted[:, 0])
     # A vehicle that hovers has no course to turn to; the turn grows with the speed.
     turn = np.clip(FOLLOW_GAIN_1_S * course, -FOLLOW_MAX_RAD_S, FOLLOW_MAX_RAD_S)
     turn *= np.minimum(1.0, speed / (0.2 * spec.max_speed_m_s))
-    return np.concatenate([wanted, turn[:, None]], axis=1)
+    return np.concatenate([wanted, turn[:, None], down], axis=1)
 
 
 def _checked(spec: ActionSpec, actions: NDArray[Any]) -> NDArray[np.float64]:
@@ -134,14 +161,23 @@ def _own(name: str) -> ActionSet:
 
 
 def command(spec: ActionSpec, action: NDArray[Any]) -> Action:
-    """Return the command of one action, () or (2,)."""
-    forward, right, turn = commands(spec, np.asarray(action)[None])[0]
-    return Action(float(forward), float(right), float(turn))
+    """Return the command of one action, () or (2,); (3,) of a set of three dimensions."""
+    forward, right, turn, *down = map(float, commands(spec, np.asarray(action)[None])[0])
+    return Action(forward, right, turn, down[0] if down else None)
 
 
 @cache
 def _table(name: str, max_speed: float) -> NDArray[np.float64]:
-    """Return the commands (25, 3) of a discrete set."""
+    """Return the commands (k, 3) of a discrete set, of three dimensions (k, 4)."""
+    if name == "arc3d-75":
+        climb = fastest_climb(max_speed)
+        return np.array(
+            [
+                (*arc, share * climb)
+                for share in CLIMB_SHARES
+                for arc in _table("arc-25", max_speed).tolist()
+            ]
+        )
     if name == "arc-25":
         rows = [
             (share * max_speed, 0.0, math.radians(rate))

@@ -18,12 +18,14 @@ DecisionTiming = Literal["sequential", "pipelined"]
 
 @dataclass(frozen=True)
 class Action:
-    """A horizontal velocity command. The pilot adds the vertical speed that holds altitude."""
+    """A velocity command. Where it says nothing of the vertical, the pilot holds an altitude."""
 
     forward_m_s: float
     right_m_s: float
     yaw_rate_rad_s: float
     """Positive clockwise seen from above."""
+    down_m_s: float | None = None
+    """Positive downwards; None: the pilot adds the vertical speed that holds the altitude."""
 
 
 ALTITUDE_P = 0.5
@@ -31,6 +33,15 @@ ALTITUDE_P = 0.5
 
 MAX_VERTICAL_M_S = 1.0
 """Limit of the altitude correction [m/s]."""
+
+CLIMB_SHARE = 0.3
+"""Fastest climb and descent of an action, as a share of the fastest level speed: 1.5 m/s where that
+is 5 m/s, which is what PX4 descends at by default (MPC_Z_VEL_MAX_DN)."""
+
+
+def fastest_climb(speed_m_s: float) -> float:
+    """Return the fastest vertical speed of an action [m/s], of the fastest level one [m/s]."""
+    return CLIMB_SHARE * speed_m_s
 
 
 def vertical_speed(altitude_m: float, down_m: float) -> float:
@@ -73,9 +84,16 @@ class CameraBound(Protocol):
 
 
 def limited(action: Action, speed_m_s: float) -> Action:
-    """Return the action with its speed limited and anything that is not finite made zero."""
+    """Return the action with its speed limited and anything that is not finite made zero.
+
+    The vertical speed, where it has one, is limited to `fastest_climb` of `speed_m_s`.
+    """
     numbers = (action.forward_m_s, action.right_m_s, action.yaw_rate_rad_s)
     forward, right, turn = (n if math.isfinite(n) else 0.0 for n in numbers)
     speed = math.hypot(forward, right)
     scale = min(1.0, speed_m_s / speed) if speed > 0.0 else 1.0
-    return Action(forward * scale, right * scale, turn)
+    down = action.down_m_s
+    if down is not None:
+        climb = fastest_climb(speed_m_s)
+        down = max(-climb, min(climb, down)) if math.isfinite(down) else 0.0
+    return Action(forward * scale, right * scale, turn, down)

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import heading_to_ned
 from airl_mav.policy.images import NUMPY, Shrink, body_bytes, paper_bytes
 from airl_mav.policy.observation import InFlight, Observation
@@ -54,6 +55,9 @@ SPEED_SCALE_M_S = 5.0
 DISTANCE_SCALE_M = 20.0
 """`body`: the distance to the goal is divided by this."""
 
+HEIGHT_SCALE_M = 5.0
+"""How far the goal lies below the vehicle is divided by this."""
+
 STRIP_HALF_WIDTH = 1
 """`paper`: the bar that draws the bearing is three columns wide."""
 
@@ -69,7 +73,7 @@ def boxes(spec: ObservationSpec) -> dict[str, Box]:
     found = {
         spec.kind: Box((spec.channels, *spec.image_shape), np.uint8, 0, 255),
         VELOCITY: Box((3,), np.float32, -math.inf, math.inf),
-        GOAL: Box((3,), np.float32, -math.inf, math.inf),
+        GOAL: Box((spec.goal_numbers,), np.float32, -math.inf, math.inf),
     }
     if spec.in_flight:
         numbers = sum(TOLD[name] for name in spec.in_flight)
@@ -94,13 +98,16 @@ def encode_layout(spec: ObservationSpec, seen: Observation, shrink: Shrink = NUM
         that sees all round; earlier frames carried to the present place and heading. Else as
         `body`.
         `body`: velocity forward, right, down / 5 m/s; goal as cosine and sine of its bearing and
-        its distance / 20 m. `paper`: velocity NED [m/s]; goal as north, east [m] and distance [m].
+        its distance / 20 m; with `goal_height` (n, 4): behind them how far it lies below the
+        vehicle / 5 m, and the distance is the level one. `paper`: velocity NED [m/s]; goal as
+        north, east [m] and distance [m].
         Where the network is told more, `in_flight` (n, k) float32: forward, right / 5 m/s and yaw
         rate [rad/s]; latency [s]; age [s].
 
     Raises:
         ValueError: The network is told of decisions of which nobody keeps account.
-        UsageError: A layout of the user's gives anything else than it says.
+        UsageError: A layout of the user's gives anything else than it says; or the network is told
+            how high the goal is, and it has no height.
     """
     if spec.layout not in SHIPPED:
         return own_arrays(spec, seen)
@@ -111,6 +118,8 @@ def encode_layout(spec: ObservationSpec, seen: Observation, shrink: Shrink = NUM
         goal = np.stack(
             [seen.goal[:, 0] / safe, seen.goal[:, 1] / safe, distance / DISTANCE_SCALE_M], axis=1
         )
+        if spec.goal_height:
+            goal = np.concatenate([goal, _below(seen)[:, None] / HEIGHT_SCALE_M], axis=1)
         velocity = seen.velocity / SPEED_SCALE_M_S
     else:
         image = np.concatenate([_bearing_strip(spec, seen)[:, None], image], axis=2)
@@ -126,6 +135,14 @@ def encode_layout(spec: ObservationSpec, seen: Observation, shrink: Shrink = NUM
     if spec.in_flight:
         encoded[IN_FLIGHT] = _told(spec.in_flight, seen.in_flight)
     return encoded
+
+
+def _below(seen: Observation) -> NDArray[np.float64]:
+    """Return how far the goals of n vehicles lie below them (n,) [m]. Raises UsageError."""
+    below = seen.goal_down
+    if below is None or not np.isfinite(below).all():
+        raise UsageError("the network is told how high the goal is, and this goal has no height")
+    return np.asarray(below, np.float64)
 
 
 def _images(spec: ObservationSpec, seen: Observation, shrink: Shrink) -> NDArray[np.uint8]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 
+from airl_mav.policy.action_sets import commands_vertical_speed
 from airl_mav.policy.card import MeasuredResult, PolicyCard
 
 MODEL_CARD_FILE = "README.md"
@@ -60,18 +61,23 @@ def _page(card: PolicyCard) -> Iterator[str]:
     if description := " ".join(card.description.split()).rstrip("."):
         yield from (f"{description[0].upper()}{description[1:]}.", "")
     yield from ("A policy of airl-mav that flies a quadcopter to a goal. In this folder:", "")
-    yield from ("```sh", "airl-sitl --policy .", "airl evaluate . --episodes 100", "```", "")
+    # One that is told of the goal's height cannot fly where goals have none, as by default.
+    where = f" --arena {training.arena}" if seen.goal_height and training.arena else ""
+    flown = f"airl-sitl --policy .{where}", f"airl evaluate .{where} --episodes 100"
+    yield from ("```sh", *flown, "```", "")
     yield from ("| | |", "|---|---|")
     image = f"{seen.kind} image"
     image = image if seen.projection == "pinhole" else f"{seen.projection} {image}"
     far = f", up to {seen.range_m:g} m" if seen.kind == "depth" else ""
+    high = " with its height" if seen.goal_height else ""
     yield (
         f"| sees | {image} of {seen.width_px}x{seen.height_px} px, {seen.horizontal_fov_deg:g} "
-        f"deg wide{far}; own velocity; goal (layout `{seen.layout}`) |"
+        f"deg wide{far}; own velocity; goal{high} (layout `{seen.layout}`) |"
     )
     yield f"| decides | `{actions.set}`, up to {actions.max_speed_m_s:.3g} m/s |"
     yield f"| holds each action | {card.hold_s:g} s |"
-    yield f"| flies at | {card.altitude_m:g} m, to within {card.goal_radius_m:g} m of the goal |"
+    flies = "begins" if commands_vertical_speed(actions) else "flies"
+    yield f"| {flies} at | {card.altitude_m:g} m, to within {card.goal_radius_m:g} m of the goal |"
     yield f"| network | {' '.join(card.network.split())} |"
     yield f"| size | {card.parameters:,} parameters, {card.macs:,} multiply-accumulates |"
     if card.algorithm:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from airl_mav.camera.frame import MM_PER_M, Frame, depth_only
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.frames import Vector, ned_to_heading, quats_to_euler
+from airl_mav.core.goals import Goal
 
 Rows = int | slice | Sequence[int] | NDArray[np.int64] | None
 """Which of n; None: the only one, as that of n = 1."""
@@ -82,6 +83,8 @@ class Observation:
     """The images of the decisions before, as far as they are kept, the newest first."""
     states: tuple[Kinematics, ...] = ()
     """Own states: the present one, and behind it those of `earlier`."""
+    goal_down: Vector | None = None
+    """(...) how far the goal lies below the vehicle [m]; None: it has no height."""
 
     def rows(self, index: Rows) -> Observation:
         """Return what vehicle `index` of n sees, or several of them."""
@@ -89,6 +92,8 @@ class Observation:
         found: dict[str, Any] = {name: np.asarray(getattr(self, name))[index] for name in names}
         if (told := self.in_flight) is not None:
             found["in_flight"] = told.rows(index)
+        if self.goal_down is not None:
+            found["goal_down"] = np.asarray(self.goal_down)[index]
         found["earlier"] = tuple(image[index] for image in self.earlier)
         found["states"] = tuple(state.rows(index) for state in self.states)
         return replace(self, **found)
@@ -113,7 +118,7 @@ class Observation:
 
     @property
     def goal_distance(self) -> float:
-        """Horizontal distance of one vehicle to its goal [m]."""
+        """Level distance of one vehicle to its goal [m]."""
         return math.hypot(self.goal[0], self.goal[1])
 
     @property
@@ -126,8 +131,8 @@ Earlier = Sequence[tuple[NDArray[Any], Kinematics]]
 """Images and states of the decisions before, the newest first."""
 
 
-def encode(frame: Frame, state: Kinematics, goal: tuple[float, float]) -> Observation:
-    """Return the observation of a frame, telemetry and a goal (north, east [m])."""
+def encode(frame: Frame, state: Kinematics, goal: Goal) -> Observation:
+    """Return the observation of a frame, telemetry and a goal."""
     return observe(frame.image, frame.intrinsics, state, np.asarray(goal, np.float64))
 
 
@@ -145,13 +150,13 @@ def observe(
         image: As `Observation.image`.
         intrinsics: The camera.
         state: Telemetry.
-        goal: (..., 2) north, east [m].
+        goal: (..., 2) north, east [m], or (..., 3): down as well, where it has a height.
         in_flight: What is known of the decisions; None: nothing is.
         earlier: What the decisions before saw, and the states they saw it in, the newest first.
     """
     roll, pitch, yaw = quats_to_euler(state.quaternion)
     to_goal = np.zeros_like(state.position)
-    to_goal[..., :2] = goal - state.position[..., :2]
+    to_goal[..., :2] = goal[..., :2] - state.position[..., :2]
     return Observation(
         image=image,
         intrinsics=intrinsics,
@@ -163,4 +168,5 @@ def observe(
         in_flight=in_flight,
         earlier=tuple(image for image, _ in earlier),
         states=(state, *(then for _, then in earlier)),
+        goal_down=goal[..., 2] - state.position[..., 2] if goal.shape[-1] == 3 else None,
     )

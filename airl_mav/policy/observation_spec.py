@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core import plugins
@@ -46,6 +46,14 @@ Frames = Annotated[
     ),
 ]
 
+GoalHeight = Annotated[
+    bool,
+    Field(
+        description="whether `goal` has a fourth number: how far the goal lies below the vehicle;"
+        " only where goals have a height, and not with layout paper"
+    ),
+]
+
 
 class ObservationSpec(ProfileModel):
     """What a network takes, and the camera that can provide it."""
@@ -80,6 +88,15 @@ class ObservationSpec(ProfileModel):
         description="what else the network is told: command, the newest setpoint; latency, the t2"
         " that is expected; age, of the image",
     )
+    goal_height: GoalHeight = False
+
+    @model_serializer(mode="wrap")
+    def _without_unused(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out what says nothing: a card reads as before there was a choice."""
+        data: dict[str, Any] = dump(self)
+        if not self.goal_height:
+            data.pop("goal_height", None)
+        return data
 
     @model_validator(mode="after")
     def _camera_has_rows(self) -> ObservationSpec:
@@ -92,6 +109,8 @@ class ObservationSpec(ProfileModel):
             raise ValueError(f"frames = {self.frames}: accepted: 1 with layout 'paper'")
         if self.kind != "depth" and self.layout in ("paper", "scan"):
             raise ValueError(f"kind = {self.kind!r}: accepted: 'depth' with layout {self.layout!r}")
+        if self.goal_height and self.layout == "paper":
+            raise ValueError("goal_height = true: accepted: false with layout 'paper'")
         check_fov("horizontal_fov_deg", self.projection, self.horizontal_fov_deg)
         return self
 
@@ -112,6 +131,11 @@ class ObservationSpec(ProfileModel):
         """Bearings of a scan that are repeated at either end."""
         whole = self.layout == "scan" and goes_round(math.radians(self.horizontal_fov_deg))
         return self.width_px // SEAM_SHARE if whole else 0
+
+    @property
+    def goal_numbers(self) -> int:
+        """Numbers that a shipped layout says of the goal."""
+        return 4 if self.goal_height else 3
 
     @property
     def channels(self) -> int:

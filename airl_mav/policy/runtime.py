@@ -16,7 +16,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.policy.action_sets import ActionSpec, discrete_actions
+from airl_mav.policy.action_sets import ActionSpec, continuous_numbers, discrete_actions
 from airl_mav.policy.layouts import boxes
 from airl_mav.policy.observation_spec import ObservationSpec
 
@@ -33,9 +33,6 @@ Shapes = Mapping[str, tuple[int, ...]]
 
 Memory = dict[str, NDArray[np.float32]]
 """What the networks of n flights remember: arrays of n rows by name."""
-
-CONTINUOUS_OUTPUTS = 2
-"""Numbers of a continuous action: forward and right speed."""
 
 _ERRORS_ONLY = 3
 """ONNX Runtime's severity: warnings about the machine are not for the pilot."""
@@ -72,7 +69,7 @@ def blank_memory(shapes: Shapes, n: int) -> Memory:
 
 def outputs_of(actions: ActionSpec) -> int:
     """Return the number of outputs: a score for each discrete action, or the action itself."""
-    return discrete_actions(actions) or CONTINUOUS_OUTPUTS
+    return discrete_actions(actions) or continuous_numbers(actions)
 
 
 class OnnxRuntime:

@@ -29,6 +29,7 @@ IR_VERSION = 10
 
 KERNEL = 3
 VECTOR_INPUTS = 6
+"""Velocity and goal; one more where the network is told how high the goal is."""
 GREATEST_BYTES = 1_900_000_000
 """An .onnx file with its weights inside stays below 2 GiB (a limit of its encoding)."""
 
@@ -42,7 +43,13 @@ class Size(NamedTuple):
 
 
 def template_size(
-    layers: int, filters: int, height_px: int, width_px: int, outputs: int, channels: int = 1
+    layers: int,
+    filters: int,
+    height_px: int,
+    width_px: int,
+    outputs: int,
+    channels: int = 1,
+    vector_inputs: int = VECTOR_INPUTS,
 ) -> Size:
     """Return the size of a network of the template; `channels` are those of its image."""
     pixels = height_px * width_px
@@ -51,7 +58,7 @@ def template_size(
         kernel = KERNEL * KERNEL * channels * filters
         weights, biases, macs = weights + kernel, biases + filters, macs + kernel * pixels
         channels = filters
-    inputs = filters * pixels + VECTOR_INPUTS
+    inputs = filters * pixels + vector_inputs
     for units in (*[filters] * layers, outputs):
         weights, biases, macs = weights + inputs * units, biases + units, macs + inputs * units
         inputs = units
@@ -74,7 +81,8 @@ def write_template(
         UsageError: The network is too large for one .onnx file.
     """
     spec, outputs = facts.observation, outputs_of(facts.actions)
-    size = template_size(layers, filters, *spec.image_shape, outputs, spec.channels)
+    shape, vectors = spec.image_shape, _vector_inputs(spec)
+    size = template_size(layers, filters, *shape, outputs, spec.channels, vectors)
     if 4 * size.parameters > GREATEST_BYTES:
         raise UsageError(
             f"--network {layers}x{filters}: {size.parameters:,} parameters; accepted: at most "
@@ -91,6 +99,10 @@ def write_template(
     )
     write_card(folder, card)
     return card
+
+
+def _vector_inputs(spec: ObservationSpec) -> int:
+    return VECTOR_INPUTS - 3 + spec.goal_numbers
 
 
 def build_template(
@@ -142,7 +154,7 @@ def build_template(
         channels = filters
     flat = node("Flatten", [x], "flat", axis=1)
     x = node("Concat", [flat, VELOCITY, GOAL], "joined", axis=1)
-    inputs = filters * math.prod(spec.image_shape) + VECTOR_INPUTS
+    inputs = filters * math.prod(spec.image_shape) + _vector_inputs(spec)
     for k in range(layers):
         dense = [x, random(f"dense{k}.weight", (filters, inputs)), zeros(f"dense{k}.bias", filters)]
         x = node("Relu", [node("Gemm", dense, f"dense{k}", transB=1)], f"dense{k}.relu")
@@ -157,7 +169,7 @@ def build_template(
         [
             helper.make_tensor_value_info(spec.kind, TensorProto.UINT8, image),
             helper.make_tensor_value_info(VELOCITY, TensorProto.FLOAT, ["n", 3]),
-            helper.make_tensor_value_info(GOAL, TensorProto.FLOAT, ["n", 3]),
+            helper.make_tensor_value_info(GOAL, TensorProto.FLOAT, ["n", spec.goal_numbers]),
         ],
         [helper.make_tensor_value_info(ACTION, TensorProto.FLOAT, ["n", outputs])],
         weights,

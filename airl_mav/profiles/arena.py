@@ -5,12 +5,19 @@ from __future__ import annotations
 import re
 from typing import Annotated, Any, Literal, get_args
 
-from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import (
+    Field,
+    SerializerFunctionWrapHandler,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
 
 from airl_mav.core.fields import Each, ProfileModel, quantity
 from airl_mav.core.plugins import GENERATORS, part_name
 from airl_mav.profiles.appearance import DEFAULT, Appearance
 from airl_mav.profiles.assets import ASSETS, Asset
+from airl_mav.profiles.gates import Gates, check_gates
 
 ShapeName = Literal["box", "cylinder", "sphere"]
 SHAPES: tuple[ShapeName, ...] = get_args(ShapeName)
@@ -63,6 +70,19 @@ class Goal(ProfileModel):
     clearance_m: float = quantity(
         "free way around the goal, to static obstacles and walls", "m", ge=0.5, le=50, default=2
     )
+    height_m: Annotated[tuple[float, float], Each(0.2, 50, ascending=True)] | None = quantity(
+        "height of the goal above the floor, drawn from [least, greatest]; one number: always that;"
+        " left out: it has none, and is reached at any height",
+        "m",
+        default=None,
+    )
+
+    @field_validator("height_m", mode="before")
+    @classmethod
+    def _one_height(cls, value: object) -> object:
+        """Take one number for both ends of the range."""
+        one = isinstance(value, int | float) and not isinstance(value, bool)
+        return (value, value) if one else value
 
     @model_validator(mode="after")
     def _both_or_none(self) -> Goal:
@@ -172,6 +192,9 @@ class ArenaSpec(ProfileModel):
     moving: MovingObstacles = Field(
         default_factory=MovingObstacles, description="obstacles that move"
     )
+    gates: Gates = Field(
+        default_factory=Gates, description="walls with openings that are on the way to the goal"
+    )
     assets: dict[str, Asset] = Field(
         default_factory=dict, description="things of your own, made of parts, by name"
     )
@@ -192,6 +215,10 @@ class ArenaSpec(ProfileModel):
             del data["appearance"]
         if not self.assets and self.asset_scale == (1.0, 1.0):
             del data["assets"], data["asset_scale"]
+        if self.gates == Gates():
+            del data["gates"]
+        if self.goal.height_m is None:
+            del data["goal"]["height_m"]
         return data
 
     @property
@@ -208,6 +235,7 @@ class ArenaSpec(ProfileModel):
         self._check_start()
         self._check_goal()
         self._check_assets()
+        self._check_gates()
         for name in ("static", "moving"):
             self._check_heights(name, getattr(self, name))
         return self
@@ -223,6 +251,12 @@ class ArenaSpec(ProfileModel):
                 )
 
     def _check_goal(self) -> None:
+        wall, heights = self.size.height_m, self.goal.height_m
+        if heights is not None and heights[1] > wall:
+            raise ValueError(
+                f"goal.height_m = {list(heights)}: accepted: value <= {wall:g} m (size.height_m,"
+                " the walls)"
+            )
         if self.goal.fixed is None:
             if self.goal.min_distance_m >= self.zones_m[0]:
                 raise ValueError(
@@ -239,6 +273,41 @@ class ArenaSpec(ProfileModel):
                     f"goal.{axis} = {value:g}: accepted: {low:g} <= value <= {high:g} m from the "
                     f"start (inside the walls, goal.clearance_m {free:g})"
                 )
+
+    def _check_gates(self) -> None:
+        if self.gates.count[1] == 0:
+            return
+        if self.generator != OBSTACLES:
+            raise ValueError(
+                f"gates.count = {list(self.gates.count)}: accepted: 0 with a generator of your own"
+            )
+        check_gates(
+            self.gates,
+            west_m=self.start.east_m,
+            east_m=self.size.east_m - self.start.east_m,
+            height_m=self.size.height_m,
+            free_m=self.start.clearance_m,
+        )
+        self._check_behind_gates()
+
+    def _check_behind_gates(self) -> None:
+        """Refuse gates that leave no room for the goal behind the last of them."""
+        last, free = self.gates.last_m, self.goal.clearance_m
+        fixed = self.goal.fixed
+        if fixed is not None:
+            if fixed[0] < last + free:
+                raise ValueError(
+                    f"goal.north_m = {fixed[0]:g}: accepted: value >= {last + free:g} m, behind the"
+                    f" last of the gates (goal.clearance_m {free:g})"
+                )
+            return
+        far = min(self.zones_m[-1], self.size.north_m - self.start.north_m - free)
+        if last + free >= far:
+            raise ValueError(
+                f"gates.count = {list(self.gates.count)}: the last may be {last:g} m from the "
+                f"start; accepted: less than {far - free:g} m, so that there is room for the goal "
+                f"behind it (zones_m, size.north_m, goal.clearance_m {free:g})"
+            )
 
     def _check_assets(self) -> None:
         for name, asset in self.assets.items():

@@ -18,6 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from airl_mav.core.errors import EXIT_BROKEN, EXIT_USAGE, UsageError
 from airl_mav.core.fields import field_error
+from airl_mav.core.goals import Goal
 from airl_mav.core.process_use import ProcessUse
 from airl_mav.scenario.resolved import ResolvedScenario
 from airl_mav.view.ends import ViewEnds
@@ -77,7 +78,7 @@ class Fly(_Line):
 
     type: Literal["fly"] = "fly"
     episode: int
-    goal: tuple[float, float]
+    goal: Goal
     """North, east [m] from the start."""
     epoch_ns: int | None
     """Host monotonic time of simulated time 0 when both share a host; None = start a clock."""
@@ -127,7 +128,7 @@ class Loaded(_Line):
     """Host monotonic time of simulated time 0; None when time is not paced."""
     slipped_us: int
     """Simulated time given up before, because the host could not keep up."""
-    goal: tuple[float, float]
+    goal: Goal
 
 
 class State(_Line):

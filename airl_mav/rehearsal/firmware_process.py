@@ -203,7 +203,7 @@ class Service:
                 time_us=loaded.time_us,
                 epoch_ns=loaded.epoch_ns,
                 slipped_us=self._firmware.slipped_us,
-                goal=(float(arena.goal[0]), float(arena.goal[1])),
+                goal=arena.goal_point,
             )
         )
 

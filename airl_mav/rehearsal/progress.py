@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 from airl_mav.core.constants import US_PER_S
+from airl_mav.core.goals import Goal, goal_distance_m
 from airl_mav.core.progress import Progress
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
@@ -33,7 +33,7 @@ class Observer:
     def waiting(self, what: str) -> None:
         """Something is being waited for."""
 
-    def episode(self, index: int, seed: int, goal: tuple[float, float]) -> None:
+    def episode(self, index: int, seed: int, goal: Goal) -> None:
         """An episode begins; its goal (north, east) [m]."""
 
     def phase(self, phase: str, time_us: int) -> None:
@@ -64,14 +64,14 @@ class LiveObserver(Observer):
         self._progress = progress
         self._tally = Tally(progress, "flights", folder, done, episodes)
         self._flight = ""
-        self._goal = (0.0, 0.0)
+        self._goal: Goal = (0.0, 0.0)
         self._phase = ""
 
     def waiting(self, what: str) -> None:
         """Show what is being waited for."""
         self._progress.status(what)
 
-    def episode(self, index: int, seed: int, goal: tuple[float, float]) -> None:
+    def episode(self, index: int, seed: int, goal: Goal) -> None:
         """Show that an episode begins."""
         self._goal = goal
         self._phase = "booting"
@@ -85,7 +85,7 @@ class LiveObserver(Observer):
 
     def state(self, state: State, started_us: int) -> None:
         """Show the vehicle's true state."""
-        away = math.hypot(self._goal[0] - state.position[0], self._goal[1] - state.position[1])
+        away = goal_distance_m(self._goal, state.position)
         self._progress.watch(
             f"{self._flight}: {self._phase:<10} {(state.time_us - started_us) / US_PER_S:5.1f} s "
             f"{away:5.1f} m to goal {state.speed_m_s:4.1f} m/s "

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 
 from airl_mav.arena.generate import generate
 from airl_mav.camera.conditions import check_noise, check_renderer
+from airl_mav.core.goals import Goal
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loaded import check_spread, equipped
 from airl_mav.profiles.loading import load_profile
@@ -32,8 +33,8 @@ class Listener:
 
     waiting: Callable[[str], None] = field(default=lambda _what: None)
     """Real firmware is waited for: how the user starts it."""
-    ready: Callable[[str, tuple[float, float]], None] = field(default=lambda _camera, _goal: None)
-    """The vehicle stands ready: ZeroMQ address of its camera; goal (north, east) [m]."""
+    ready: Callable[[str, Goal], None] = field(default=lambda _camera, _goal: None)
+    """The vehicle stands ready: ZeroMQ address of its camera; goal."""
     text: Callable[[Message], None] = field(default=lambda _message: None)
     """The autopilot said something."""
     say: Callable[[str], None] = field(default=lambda _line: None)
@@ -108,8 +109,8 @@ def aircraft_of(asked: StandAloneVehicle) -> tuple[VehicleProfile, float]:
 
 def episode_of(
     asked: StandAloneVehicle, vehicle: VehicleProfile, computer_w: float
-) -> tuple[EpisodeSetup, tuple[float, float]]:
-    """Return the episode that is flown, and its goal (north, east) [m].
+) -> tuple[EpisodeSetup, Goal]:
+    """Return the episode that is flown, and its goal.
 
     Args:
         asked: Where it is flown, and in what.
@@ -123,5 +124,4 @@ def episode_of(
     check_renderer(vehicle.camera, asked.renderer, spec)
     width_m = vehicle.body.width_m
     arena = generate(spec, asked.seed, name=asked.arena, vehicle_width_m=width_m)
-    goal = (float(arena.goal[0]), float(arena.goal[1]))
-    return EpisodeSetup(vehicle, arena, asked.seed, asked, computer_w), goal
+    return EpisodeSetup(vehicle, arena, asked.seed, asked, computer_w), arena.goal_point

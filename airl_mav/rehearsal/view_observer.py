@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from airl_mav.core.goals import Goal
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.rehearsal.channel import State, Text
 from airl_mav.rehearsal.progress import WARNING, Observer
@@ -25,7 +26,7 @@ class ViewObserver(Observer):
         """Pass on what is being waited for."""
         self._onwards.waiting(what)
 
-    def episode(self, index: int, seed: int, goal: tuple[float, float]) -> None:
+    def episode(self, index: int, seed: int, goal: Goal) -> None:
         """Tell that an episode begins."""
         self._feed.send(Flight(index=index, seed=seed, goal=goal))
         self._onwards.episode(index, seed, goal)

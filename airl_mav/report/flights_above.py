@@ -102,7 +102,7 @@ def _extent(panels: Sequence[Panel]) -> _Extent:
     """Return the least part of the world that holds all walls, paths and goals."""
     low, high = np.zeros(2), np.zeros(2)
     for panel in panels:
-        points = [np.array([flight.goal for flight in panel.episodes])]
+        points = [np.array([flight.goal[:2] for flight in panel.episodes])]
         if panel.arena is not None:
             b = panel.arena.bounds
             points.append(np.array([(b.north_min, b.east_min), (b.north_max, b.east_max)]))

@@ -20,6 +20,7 @@ from airl_mav.camera.render import camera_pose
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import Arrays
+from airl_mav.core.goals import Goal
 from airl_mav.core.plugins import names_code
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory
@@ -65,7 +66,8 @@ class PolicyAgain:
 
     policy: LearnedPolicy
     actions: NDArray[np.float64]
-    """(k, 3) commands of its actions: forward, right [m/s], yaw rate [rad/s]."""
+    """(k, 3) commands of its actions: forward, right [m/s], yaw rate [rad/s]; of a set of three
+    dimensions (k, 4): behind them the downward speed [m/s]."""
 
     @property
     def scores_are(self) -> str:
@@ -133,7 +135,8 @@ def seen_decisions(
             encoded = encode_layout(policy.card.observation, seen.rows(None))
             scores = policy.outputs(encoded)[0]
             best = again.actions[int(np.argmax(scores))]
-            same = bool(np.abs(best - setpoint[[0, 1, 3]]).max() < SAME_ACTION)
+            flown = setpoint[[0, 1, 3, 2]][: len(best)]
+            same = bool(np.abs(best - flown).max() < SAME_ACTION)
         yield SeenDecision(number, seen.image, scores, same)
         stops = None if hover_s is None else sent + round((lasts_s + hover_s) * US_PER_S)
         companion.decided(setpoint, ready - began, sent, stops)
@@ -176,7 +179,7 @@ class _Companion:
         self,
         image: NDArray[Any],
         state: Kinematics,
-        goal: tuple[float, float],
+        goal: Goal,
         age_us: int,
         now_us: int,
     ) -> Observation:

@@ -13,6 +13,7 @@ from airl_mav.black_box.messages import Decision, End, Phase, Resources, Status,
 from airl_mav.black_box.reading import BlackBox
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.files import typed
+from airl_mav.core.goals import Goal, goal_distance_m
 from airl_mav.core.process_use import ProcessUse
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.quality import measure_quality
@@ -51,7 +52,7 @@ class FlownLimits:
 class FlownSettings:
     """What a flight's page needs of its settings."""
 
-    goal: tuple[float, float]
+    goal: Goal
     seed: int
     speed: Annotated[float, Field(gt=0.0)]
     pilot: FlownPilot
@@ -205,7 +206,7 @@ def _arrived_us(
     if navigation_us is None:
         return None
     flown = path.between(navigation_us, ended_us)
-    away = np.hypot(*(flown.position[:, :2] - asked.goal).T)
+    away = np.array([goal_distance_m(asked.goal, here) for here in flown.position])
     there = np.flatnonzero(away < asked.pilot.goal_radius_m)
     return int(flown.time_us[there[0]]) if len(there) else None
 

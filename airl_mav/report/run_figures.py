@@ -154,7 +154,7 @@ def map_figure(
 
 def _draw_goal(ax: Axes, episode: EpisodeRecord) -> None:
     """Draw start and goal where no arena does."""
-    north, east = episode.goal
+    north, east = episode.goal[:2]
     colour = OUTCOME_COLOURS[Outcome.SUCCESS]
     ax.add_patch(
         Circle((east, north), episode.goal_radius_m, facecolor="none", edgecolor=colour, lw=1.0)

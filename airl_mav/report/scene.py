@@ -20,6 +20,7 @@ from airl_mav.arena.draw import GOAL_COLOUR, MOVING_COLOURS, START_COLOUR
 from airl_mav.arena.geometry import Arena, Obstacles, Shape
 from airl_mav.arena.triangles import drawn, standing
 from airl_mav.core.constants import US_PER_S
+from airl_mav.core.goals import goal_height_m
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory
@@ -134,6 +135,7 @@ def flight_view(flight: SceneFlight, top: float, fov_deg: float) -> dict[str, An
             ],
         }
     east, north = record.goal[1], record.goal[0]
+    up = goal_height_m(record.goal) or 0.1
     speed_bar = {"title": {"text": "m/s"}, "thickness": 12, "len": 0.5, "x": 1.0}
     scale = [[i / 15.0, _hex(speed_colours()(i / 15.0))] for i in range(16)]
     traces += [
@@ -153,7 +155,7 @@ def flight_view(flight: SceneFlight, top: float, fov_deg: float) -> dict[str, An
             "hovertemplate": "%{customdata[0]:.1f} s, %{customdata[1]:.1f} m/s<extra></extra>",
         },
         _line(_ring(east, north, record.goal_radius_m), GOAL_COLOUR, "goal", width=4),
-        _marks(np.array([[east, north, 0.1]]), GOAL_COLOUR, "goal", symbol="diamond"),
+        _marks(np.array([[east, north, up]]), GOAL_COLOUR, "goal", symbol="diamond"),
         _marks(np.zeros((1, 3)), START_COLOUR, "start", symbol="square"),
         _marks(
             place[-1:],

@@ -187,8 +187,8 @@ class Decisions(Inference):
     )
     goal_radius_m: GoalRadius | None = Field(
         default=None,
-        description="the goal is reached closer than this, seen from above; by default that of the"
-        " policy's card, or 3",
+        description="the goal is reached closer than this: seen from above, if it has no height; by"
+        " default that of the policy's card, or 3",
     )
     max_speed_m_s: Annotated[float | None, NO_TWIN] = quantity(
         "horizontal speed limit of all actions; by default the fastest action of the policy's card,"

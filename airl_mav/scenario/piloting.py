@@ -13,6 +13,7 @@ import numpy as np
 from airl_mav.core.constants import US_PER_MS
 from airl_mav.core.cpu_quota import check_permitted
 from airl_mav.core.errors import FieldError
+from airl_mav.core.goals import Goal
 from airl_mav.latency.injection import Injection
 from airl_mav.latency.source import select_injection
 from airl_mav.policy.actions import Policy
@@ -71,6 +72,23 @@ def decide_piloting(
             f"more than the hold time, {pilot.hold_s:g} s, or every decision is overdue",
         )
     return pilot, asked.watchdog.model_copy(update={"hover_after_s": hover_s})
+
+
+def check_goal_height(policy: PolicyInfo, goal: Goal, field: str, asked: object) -> None:
+    """Raise FieldError for a policy that is told the goal's height, and a goal that has none.
+
+    Args:
+        policy: What flies.
+        goal: Where to.
+        field: What says where the goal is.
+        asked: Its value.
+    """
+    if policy.card is not None and policy.card.observation.goal_height and len(goal) == 2:
+        raise FieldError(
+            field,
+            asked,
+            f"a goal with a height, which policy {policy.name} is told (its card's goal_height)",
+        )
 
 
 def check_quota(asked: Decisions, injection: Injection, level: LevelName) -> None:

@@ -21,7 +21,12 @@ from airl_mav.scenario.checks import (
     check_ports,
 )
 from airl_mav.scenario.model import Scenario
-from airl_mav.scenario.piloting import NATIVE_T2_US, check_quota, decide_piloting
+from airl_mav.scenario.piloting import (
+    NATIVE_T2_US,
+    check_goal_height,
+    check_quota,
+    decide_piloting,
+)
 from airl_mav.scenario.resolved import ResolvedScenario
 
 
@@ -66,7 +71,8 @@ def resolve(scenario: Scenario) -> ResolvedScenario:
         watchdog=watchdog,
     )
     # What cannot be flown is better found here than by a process that is already flying.
-    resolved.arena_of(scenario.seed)
+    goal = resolved.arena_of(scenario.seed).goal_point
+    check_goal_height(policy, goal, "arena", scenario.arena)
     resolved.fresh_policy(scenario.seed)
     resolved.compensator()
     return resolved

@@ -13,6 +13,7 @@ from pydantic import BaseModel
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.constants import Level
+from airl_mav.core.goals import Goal
 from airl_mav.flight.judge import Task
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.setup import BUILT_IN, Part, Setup
@@ -175,8 +176,8 @@ class ResolvedScenario:
         )
         return set_out_later(arena, self.takeoff_s)
 
-    def task(self, goal: tuple[float, float]) -> Task:
-        """Return what the referee asks of a flight to a goal (north, east) [m]."""
+    def task(self, goal: Goal) -> Task:
+        """Return what the referee asks of a flight to a goal."""
         return Task(goal, self.pilot.goal_radius_m, self.scenario.time_limit_s)
 
     @property

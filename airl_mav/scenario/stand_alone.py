@@ -11,6 +11,7 @@ from pydantic import Field
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity
+from airl_mav.core.goals import Goal
 from airl_mav.core.ports import LOOPBACK
 from airl_mav.faults.kinds import PROCESSES
 from airl_mav.flight.judge import TIME_LIMIT_S, GoalRadius, TimeLimit
@@ -120,7 +121,8 @@ class StandAloneVehicle(Aircraft):
     goal_radius_m: GoalRadius | None = Field(
         default=None,
         description="in lockstep: judge the flight, and tell the companion when it is lost; the"
-        " goal is reached closer than this, seen from above; by default nobody judges",
+        " goal is reached closer than this: seen from above, if it has no height; by default"
+        " nobody judges",
     )
     time_limit_s: TimeLimit = Field(
         default=TIME_LIMIT_S,
@@ -175,8 +177,10 @@ class StandAloneCompanion(CompanionAddresses, Lateness, Decisions):
         " hexadecimal digits, mode 0600); over udpin:// only",
     )
     policy: PolicyName = DEFAULT_POLICY
-    goal: tuple[float, float] = Field(
-        default=(20.0, 0.0), description="goal, north and east of the start, m, within 10 km"
+    goal: Goal = Field(
+        default=(20.0, 0.0),
+        description="goal, north and east of the start, m, within 10 km; with a third number, down:"
+        " -4 is 4 m above the start; without it the goal has no height",
     )
     start: Start = Field(
         default="arm",

@@ -134,8 +134,8 @@ class AlgorithmSpec(ProfileModel):
     )
     expert: ExpertName = Field(
         default="planner",
-        description="who is imitated: greedy, which sees what the policy sees, or planner, which "
-        "knows the true arena",
+        description="who is imitated: greedy, which sees what the policy sees, planner, which "
+        "knows the true arena, or gates, which knows the openings of the arena's gates",
     )
     options: dict[str, Option] = Field(
         default_factory=dict,

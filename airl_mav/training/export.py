@@ -19,11 +19,11 @@ from torch import nn
 
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.plugins import MODELS, load_part
-from airl_mav.policy.action_sets import ActionSpec, discrete_actions
+from airl_mav.policy.action_sets import ActionSpec, continuous_numbers, discrete_actions
 from airl_mav.policy.card import PolicyCard, PolicyFacts
 from airl_mav.policy.layouts import GOAL, IN_FLIGHT, VELOCITY, boxes
 from airl_mav.policy.observation_spec import ObservationSpec
-from airl_mav.policy.runtime import CONTINUOUS_OUTPUTS, first_line
+from airl_mav.policy.runtime import first_line
 from airl_mav.profiles.camera_kind import CHANNELS, KINDS
 from airl_mav.training.export_request import ExportRequest, Taken
 from airl_mav.training.onnx_export import (
@@ -198,13 +198,13 @@ def check_spaces(model: BaseAlgorithm, spec: ObservationSpec, actions: ActionSpe
             )
     elif not (
         isinstance(space, spaces.Box)
-        and space.shape == (CONTINUOUS_OUTPUTS,)
+        and space.shape == (continuous_numbers(actions),)
         and (space.low == -1.0).all()
         and (space.high == 1.0).all()
     ):
         raise UsageError(
             f"action space {space}; accepted with {actions.set!r}: "
-            f"Box(-1.0, 1.0, ({CONTINUOUS_OUTPUTS},), float32)"
+            f"Box(-1.0, 1.0, ({continuous_numbers(actions)},), float32)"
         )
 
 
@@ -251,10 +251,15 @@ def taken_by(model: BaseAlgorithm) -> Taken:
     images = seen.spaces if isinstance(seen, spaces.Dict) else {}
     kind = next((key for key in KINDS if key in images), None)
     shape = None if kind is None else images[kind].shape
-    actions = "velocity" if isinstance(space, spaces.Box) else None
+    actions: str | None = None
+    if isinstance(space, spaces.Box):
+        actions = "velocity3d" if space.shape == (3,) else "velocity"
+    goal = images.get(GOAL)
+    tells_height = goal is not None and goal.shape == (4,)
     if kind is None or shape is None or len(shape) != 3:
         return Taken(actions=actions)
-    return Taken(f"{shape[2]}x{shape[1]}", shape[0] // CHANNELS[kind], actions, kind)
+    image = f"{shape[2]}x{shape[1]}"
+    return Taken(image, shape[0] // CHANNELS[kind], actions, kind, tells_height or None)
 
 
 def load_module(name: str, weights: Path | None, keys: Sequence[str] = USUAL) -> nn.Module:

@@ -28,7 +28,7 @@ from airl_mav.scenario.model import PilotSettings
 FLOWN = ("hold_s", "goal_radius_m", "altitude_m", "hover_after_s")
 """How a policy is flown: fields of the request, of a card and of an environment's episodes."""
 
-SEEN = ("layout", "frames", "kind", "projection", "horizontal_fov_deg", "range_m")
+SEEN = ("layout", "frames", "kind", "projection", "horizontal_fov_deg", "range_m", "goal_height")
 """What a policy sees but for the image's size: fields of the request and of a card."""
 
 DEFAULTS: dict[str, Any] = {
@@ -39,6 +39,7 @@ DEFAULTS: dict[str, Any] = {
     "projection": "pinhole",
     "horizontal_fov_deg": 90.0,
     "range_m": 20.0,
+    "goal_height": False,
     "actions": "arc-25",
     "max_speed_m_s": PAPER_SPEED_M_S,
     "hold_s": PilotSettings.hold_s,
@@ -58,6 +59,7 @@ class Taken(NamedTuple):
     frames: int | None = None
     actions: ActionSetName | None = None
     kind: CameraKind | None = None
+    goal_height: bool | None = None
 
 
 class ExportRequest(BaseModel):
@@ -114,11 +116,17 @@ class ExportRequest(BaseModel):
     range_m: float | None = Field(
         default=None, description="depth from which on everything looks far, m; by default 20"
     )
+    goal_height: bool | None = Field(
+        default=None,
+        description="whether the model is told how far the goal lies below the vehicle; by default"
+        " as the .zip says, or not",
+    )
     actions: ActionSetName | None = Field(
         default=None,
         description="action set that the model was trained with: arc-25, paper-25, velocity,"
-        " velocity-fixed-yaw, or your own as MODULE:NAME or FILE.py:NAME; by default arc-25, or"
-        " velocity where a .zip has continuous actions",
+        " velocity-fixed-yaw, arc3d-75, velocity3d, velocity3d-fixed-yaw, or your own as"
+        " MODULE:NAME or FILE.py:NAME; by default arc-25, or velocity where a .zip has continuous"
+        " actions, velocity3d where they are three",
     )
     max_speed_m_s: float | None = Field(
         default=None, description=f"fastest action, m/s; by default {PAPER_SPEED_M_S:g}"
@@ -239,6 +247,7 @@ def _known_of(spec: EnvironmentSpec) -> dict[str, Any]:
         "projection": camera.projection,
         "horizontal_fov_deg": camera.horizontal_fov_deg,
         "range_m": camera.range_m,
+        "goal_height": spec.goal_height,
         "actions": spec.actions,
         "max_speed_m_s": spec.max_speed_m_s,
         **{name: getattr(spec.episode, name) for name in FLOWN},

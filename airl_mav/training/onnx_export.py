@@ -94,9 +94,10 @@ def export_network(
     """Write a network as `export.export_sb3` does a model, and return its card.
 
     The network takes the image (`depth`, `rgb` or `grey`; (n, channels, h, w) uint8), `velocity`
-    and `goal` (n, 3) float32; it returns a score for each discrete action (n, k), or the continuous
-    action (n, 2). Scaling the image is its own business. One with a memory has it as further inputs
-    and outputs, and their shapes in its attribute `state` (`recurrent.RecurrentNetwork`).
+    and `goal` (n, 3) float32, (n, 4) where it is told the goal's height; it returns a score for
+    each discrete action (n, k), or the continuous action (n, 2), in three dimensions (n, 3).
+    Scaling the image is its own business. One with a memory has it as further inputs and outputs,
+    and their shapes in its attribute `state` (`recurrent.RecurrentNetwork`).
 
     Nothing is written unless ONNX Runtime gives what torch gives. A kill on the way leaves a policy
     without a card, or an old card that refuses the new policy: never a card for the wrong one.

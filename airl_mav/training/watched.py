@@ -271,8 +271,7 @@ class Reflight:
         navigation = self.navigation
         arena = navigation.arenas[0]
         assert arena is not None  # noqa: S101 - its episode has begun
-        north, east = arena.goal.tolist()
-        goal = north, east
+        goal = arena.goal_point
         return [
             Flight(index=taped.number, seed=taped.seed, goal=goal),
             Episode(

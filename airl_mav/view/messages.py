@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from airl_mav.arena.appearance import Statics
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, PlacedMesh, Tour
+from airl_mav.core.goals import Goal
 from airl_mav.profiles.appearance import DEFAULT, Appearance
 from airl_mav.profiles.mesh_file import MeshFile
 from airl_mav.profiles.projection import Projection
@@ -90,6 +91,8 @@ class ArenaShown(Message):
     appearance: Appearance = DEFAULT
     statics: StaticsShown | None = None
     meshes: tuple[MeshShown, ...] = ()
+    goal_height_m: float | None = None
+    n_gates: int = 0
 
     @classmethod
     def of(cls, arena: Arena) -> ArenaShown:
@@ -117,6 +120,8 @@ class ArenaShown(Message):
             appearance=arena.appearance,
             statics=statics,
             meshes=tuple(map(MeshShown.of, arena.meshes)),
+            goal_height_m=arena.goal_height_m,
+            n_gates=arena.n_gates,
         )
 
     def arena(self) -> Arena:
@@ -140,6 +145,8 @@ class ArenaShown(Message):
             if known is None
             else Statics(known.names, np.array(known.of, np.int64), known.materials),
             meshes=tuple(each.placed() for each in self.meshes),
+            goal_height_m=self.goal_height_m,
+            n_gates=self.n_gates,
         )
 
 
@@ -192,8 +199,8 @@ class Episode(Message):
     arena: ArenaShown | None
     """None: an endless floor."""
     vehicle: VehicleShape
-    goal: tuple[float, float]
-    """North, east [m]."""
+    goal: Goal
+    """North, east [m], and down where it has a height."""
     goal_radius_m: float
 
 
@@ -250,7 +257,7 @@ class Flight(Message):
     kind: Literal["flight"] = "flight"
     index: int
     seed: int
-    goal: tuple[float, float]
+    goal: Goal
 
 
 class Phase(Message):

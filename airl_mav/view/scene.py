@@ -23,6 +23,7 @@ from airl_mav.core.frames import (
     quat_multiply,
     quat_yaw,
 )
+from airl_mav.core.goals import goal_height_m
 from airl_mav.profiles.vehicle import CORNERS, COUNTER_CLOCKWISE
 from airl_mav.view.look import (
     ARROW_S,
@@ -188,7 +189,17 @@ class FlightScene:
 
     def _build_ends(self, episode: Episode, height: float) -> None:
         """Build start and goal, with a pole of a height [m]."""
-        goal = episode.goal
+        goal = episode.goal[:2]
+        if (height_m := goal_height_m(episode.goal)) is not None:
+            height = height_m
+            self._add(
+                "icosphere",
+                "/goal/ball",
+                radius=episode.goal_radius_m,
+                color=GOAL,
+                opacity=0.3,
+                position=episode.goal,
+            )
         self._add(
             "cylinder",
             "/goal/disc",

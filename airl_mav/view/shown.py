@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena
 from airl_mav.core.constants import US_PER_MS, US_PER_S
+from airl_mav.core.goals import goal_distance_m
 from airl_mav.view.messages import (
     Decided,
     Episode,
@@ -142,7 +143,7 @@ class Shown:
 
     @property
     def to_goal_m(self) -> float | None:
-        """How far the goal is, seen from above [m]."""
+        """How far the goal is: seen from above, if it has no height [m]."""
         if self.vehicle is None or self.episode is None:
             return None
-        return math.dist(self.episode.goal, self.vehicle.position[:2])
+        return goal_distance_m(self.episode.goal, self.vehicle.position)

@@ -42,7 +42,6 @@ class SimulationTap:
 
     def begin(self, seed: int, arena: Arena, started_us: int) -> None:
         """An episode begins, in an arena."""
-        north, east = arena.goal.tolist()
         self._vehicle_due = self._picture_due = -1
         self._feed.send(
             Episode(
@@ -50,7 +49,7 @@ class SimulationTap:
                 started_us=started_us,
                 arena=ArenaShown.of(arena),
                 vehicle=VehicleShape.of(self._scenario.vehicle),
-                goal=(north, east),
+                goal=arena.goal_point,
                 goal_radius_m=self._scenario.pilot.goal_radius_m,
             )
         )

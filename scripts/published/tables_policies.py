@@ -29,14 +29,19 @@ SHIPPED: dict[str, tuple[str, str]] = {
     "crowded-pipelined": ("crowded-pipelined", "run"),
     "crowded-fast": ("crowded-fast", "run"),
     "crowded-panorama": ("crowded-panorama", "run"),
+    "gates": ("gates", "run"),
 }
 """Where the flights of each policy stand: in its own arena, as late as in its training."""
 
 RECORDS = tuple(dict.fromkeys(record for record, _ in SHIPPED.values()))
 """The records that they are in."""
 
-_MAKERS = {"dqn": "double DQN", "ppo": "PPO"}
-_ACTIONS = {"arc-25": "arcs", "velocity": "continuous"}
+_MAKERS = {"dqn": "double DQN", "ppo": "PPO", "dagger": "DAgger"}
+_ACTIONS = {
+    "arc-25": "arcs",
+    "velocity": "continuous",
+    "velocity3d-fixed-yaw": "continuous, with a climb",
+}
 
 
 def _shipped(records: Records) -> list[tuple[str, FlownRun]]:

@@ -26,6 +26,7 @@ import numpy as np
 import pytest
 from pymavlink import mavutil
 
+from airl_mav.core.goals import Goal
 from airl_mav.core.signing_key import StoredSigning, write_key
 from airl_mav.flight.judge import Outcome
 from airl_mav.lockstep.flight import fly
@@ -56,7 +57,7 @@ class Reference:
     """A flight in one process."""
 
     lanes: dict[str, str]
-    goal: tuple[float, float]
+    goal: Goal
     outcome: Outcome
     scenario: ResolvedScenario
     setup: EpisodeSetup
@@ -87,7 +88,7 @@ def firmware_words(ports: TestPorts, *options: str) -> list[str]:
 
 
 def companion_words(api: int, camera: int, reference: Reference, *options: str) -> list[str]:
-    north, east = reference.goal
+    north, east = reference.goal[:2]
     return [
         *("-m", "airl_mav.cli.companion", "--lockstep"),
         *(

@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
+from airl_mav.core.goals import Goal
 from airl_mav.latency.samplers import FixedSampler
 from airl_mav.lockstep.flight import fly
 from airl_mav.lockstep.stage import Stage
@@ -30,7 +31,7 @@ BEGINS = "begins"
 class Speaking(Observer):
     """Says when a flight begins."""
 
-    def episode(self, index: int, seed: int, goal: tuple[float, float]) -> None:
+    def episode(self, index: int, seed: int, goal: Goal) -> None:
         say(BEGINS)
 
 
@@ -46,7 +47,7 @@ def demo_scenario(**changes: Any) -> ResolvedScenario:
 def fly_as_companion(
     stage: Stage,
     policy: Policy,
-    goal: tuple[float, float],
+    goal: Goal,
     *,
     stop: threading.Event | None = None,
     phase: Callable[[str], None] = lambda _: None,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import astuple
 from typing import Any
 
 import numpy as np
@@ -163,3 +164,47 @@ def test_counts_and_ranges() -> None:
             spec("arc-25", speed)
     with pytest.raises(ValidationError):
         spec("arc-26")
+
+
+# --- three dimensions
+
+
+@given(
+    st.lists(
+        st.tuples(st.floats(-2, 2), st.floats(-2, 2), st.floats(-2, 2)), min_size=1, max_size=8
+    ),
+    st.floats(0.5, 20.0),
+)
+def test_a_third_number_is_the_downward_speed_and_changes_nothing_else(
+    actions: list[tuple[float, float, float]], speed: float
+) -> None:
+    level = np.array(actions)[:, :2]
+    for name in ("velocity", "velocity-fixed-yaw"):
+        deep = commands(spec(name.replace("velocity", "velocity3d"), speed), np.array(actions))
+        np.testing.assert_array_equal(deep[:, :3], commands(spec(name, speed), level))
+        wanted = [0.3 * speed * min(1.0, max(-1.0, down)) for _, _, down in actions]
+        np.testing.assert_allclose(deep[:, 3], wanted)
+
+
+def test_the_75_arcs_are_the_25_three_times() -> None:
+    found = commands(spec("arc3d-75"), np.arange(75))
+    assert discrete_actions(spec("arc3d-75")) == 75
+    for third, down in enumerate((-1.5, 0.0, 1.5)):
+        rows = found[25 * third : 25 * third + 25]
+        np.testing.assert_array_equal(rows[:, :3], table("arc-25"))
+        np.testing.assert_allclose(rows[:, 3], down)
+
+
+def test_an_action_says_how_fast_it_sinks_only_where_its_set_does() -> None:
+    assert command(spec("velocity"), np.array([1.0, 0.0])).down_m_s is None
+    climbing = command(spec("velocity3d-fixed-yaw", 4.0), np.array([0.5, 0.0, -1.0]))
+    assert astuple(climbing) == pytest.approx((2.0, 0.0, 0.0, -1.2))
+    sinking = command(spec("arc3d-75"), np.array(74))
+    assert astuple(sinking) == pytest.approx((5.0, 0.0, math.radians(72.0), 1.5))
+
+
+@pytest.mark.parametrize(
+    ("down", "wanted"), [(-9.0, -1.5), (9.0, 1.5), (0.4, 0.4), (math.nan, 0.0), (None, None)]
+)
+def test_a_vertical_speed_is_limited(down: float | None, wanted: float | None) -> None:
+    assert limited(Action(1.0, 0.0, 0.0, down), 5.0).down_m_s == wanted

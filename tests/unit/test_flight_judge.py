@@ -42,6 +42,28 @@ def test_inside_the_circle_is_success_at_any_height(
     assert verdict.time_us == 2_000_000
 
 
+@given(
+    st.floats(0.0, 10.0),
+    st.floats(-math.pi, math.pi),
+    st.floats(-10.0, 10.0),
+)
+def test_a_goal_with_a_height_is_a_ball(distance: float, bearing: float, above: float) -> None:
+    high = Referee(Task((*TASK.goal[:2], -7.0), TASK.goal_radius_m, TASK.time_limit_s))
+    high.start_navigation(0)
+    verdict = high.observe(sample(1_000, at_distance(distance, bearing, -7.0 - above)))
+    squared = distance**2 + above**2
+    if abs(squared - 4.0) > 1e-6:
+        assert (verdict is not None) is (squared < 4.0)
+
+
+def test_the_distance_to_a_goal_with_a_height_is_told() -> None:
+    high = Referee(Task((0.0, 0.0, -9.0), 1.0, 1.0))
+    high.start_navigation(0)
+    verdict = high.observe(sample(1_000_000, (0.0, 0.0, -2.0)))
+    assert verdict is not None
+    assert verdict.reason == "7.00 m from the goal after 1 s"
+
+
 @given(st.floats(2.001, 30.0), st.floats(-math.pi, math.pi))
 def test_outside_the_circle_is_nothing(distance: float, bearing: float) -> None:
     assert flying().observe(sample(2_000_000, at_distance(distance, bearing, -2.0))) is None

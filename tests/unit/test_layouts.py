@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from airl_mav.camera.frame import depth_to_z16
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.core.errors import FieldError
+from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.envs import encoding
 from airl_mav.policy.images import NUMPY, Bytes, shrink_depth
 from airl_mav.policy.layouts import ablated, boxes, encode_layout, newest_frame
@@ -220,6 +220,34 @@ def test_vectors_against_scipy(
 def test_at_the_goal_there_is_no_direction_but_a_distance_of_zero() -> None:
     here = encode_layout(spec(), seen(np.zeros((1, 24, 32)), goal=np.zeros((1, 2))))["goal"]
     np.testing.assert_array_equal(here, [[0.0, 0.0, 0.0]])
+
+
+@pytest.mark.parametrize("layout", ["body", "scan"])
+def test_a_height_is_a_fourth_number_and_the_others_stay(layout: str) -> None:
+    shown: dict[str, Any] = {"goal_down": np.array([-2.5, 1.0])}
+    shown["goal"] = np.array([[3.0, 4.0], [0.0, 2.0]])
+    still = Kinematics(np.zeros((2, 3)), np.zeros((2, 3)), np.tile((1.0, 0.0, 0.0, 0.0), (2, 1)))
+    shown["states"] = (still,)
+    image = np.full((2, 24, 32), 4000)
+    told = encode_layout(spec(layout, goal_height=True), seen(image, **shown))
+    plain = encode_layout(spec(layout), seen(image, **shown))
+    np.testing.assert_array_equal(told["goal"][:, :3], plain["goal"])
+    np.testing.assert_allclose(told["goal"], [[0.6, 0.8, 0.25, -0.5], [0, 1, 0.1, 0.2]], atol=1e-7)
+    assert {k: v.shape for k, v in plain.items()}["goal"] == (2, 3)
+
+
+@pytest.mark.parametrize("below", [None, np.array([math.nan])])
+def test_a_goal_without_a_height_cannot_be_told(below: np.ndarray | None) -> None:
+    with pytest.raises(UsageError, match="this goal has no height"):
+        encode_layout(spec(goal_height=True), seen(np.zeros((1, 24, 32)), goal_down=below))
+
+
+def test_a_card_says_it_only_where_it_is_so() -> None:
+    assert "goal_height" not in spec().model_dump()
+    assert spec(goal_height=True).model_dump()["goal_height"] is True
+    assert spec(goal_height=True) == ObservationSpec.model_validate(
+        spec(goal_height=True).model_dump()
+    )
 
 
 def test_the_goal_to_the_right_has_a_positive_sine() -> None:

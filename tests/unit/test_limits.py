@@ -34,6 +34,7 @@ from companion.limits import (
     TELEMETRY_WRONG,
     Ending,
     Limits,
+    VehicleLimits,
     ground_in_view,
 )
 
@@ -370,3 +371,15 @@ def test_another_kind_of_image_is_another_camera() -> None:
     assert found is not None
     assert found.reason == CAMERA_WRONG
     assert at_s == pytest.approx(3.0, abs=0.11)
+
+
+def test_a_high_goal_lifts_the_height_limit() -> None:
+    """10 m above the altitude that is flown, or above the goal where that is higher."""
+    level = VehicleLimits(LimitSettings(), (20.0, 0.0), PILOT)
+    low = VehicleLimits(LimitSettings(), (20.0, 0.0, -1.0), PILOT)
+    high = VehicleLimits(LimitSettings(), (20.0, 0.0, -14.0), PILOT)
+    assert level.height_m == low.height_m == PILOT.altitude_m + 10.0
+    assert high.height_m == 24.0
+    assert level.radius_m == high.radius_m == 2.0 * 20.0 + 50.0
+    asked = VehicleLimits(LimitSettings(height_m=6.0), (20.0, 0.0, -14.0), PILOT)
+    assert asked.height_m == 6.0

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from airl_mav.core.errors import UsageError
+from airl_mav.core.goals import Goal
 from airl_mav.flight.paired import compare_pairs, percent_change
 from airl_mav.flight.record import EpisodeRecord, run_sha256
 from airl_mav.flight.statistics import aggregate
@@ -168,7 +169,7 @@ def _contrast(
     )
 
 
-def _task(episode: EpisodeRecord) -> tuple[str, int, tuple[float, float]]:
+def _task(episode: EpisodeRecord) -> tuple[str, int, Goal]:
     """Return what makes two flights of one seed the same task."""
     return episode.arena, episode.arena_seed, episode.goal
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from airl_mav.black_box.messages import Decision
 from airl_mav.core.constants import US_PER_S
+from airl_mav.core.goals import goal_distance_m
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.stamps import NO_STAMP, STAMPS
 from airl_mav.rehearsal.run_folder import RunInfo
@@ -110,7 +111,7 @@ def decision_messages(flight: RecordedFlight) -> list[Decision]:
     The state that a decision saw is that of the moment at which its inference began.
     """
     columns, believed = flight.decisions, flight.believed
-    north, east = flight.replayed.record.goal
+    goal = flight.replayed.record.goal
     held_before_us, found = NO_STAMP, []
     for i in range(len(columns.get("sent_us", ()))):
         stamps = {name: int(columns[name][i]) for name in STAMPS}
@@ -122,7 +123,7 @@ def decision_messages(flight: RecordedFlight) -> list[Decision]:
                 position=tuple(position.tolist()),
                 velocity=tuple(velocity.tolist()),
                 quaternion=tuple(quaternion.tolist()),
-                goal_away_m=float(np.hypot(position[0] - north, position[1] - east)),
+                goal_away_m=goal_distance_m(goal, position),
                 setpoint=tuple(columns["setpoint"][i].astype(float).tolist()),
             )
         )

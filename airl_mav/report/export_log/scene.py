@@ -29,6 +29,7 @@ from foxglove.messages import (
 from airl_mav.arena.geometry import Arena, Bounds, PlacedMesh, Shape
 from airl_mav.arena.triangles import drawn, standing
 from airl_mav.core.frames import frd_to_flu, ned_to_enu, quat_from_direction, quat_from_euler
+from airl_mav.core.goals import Goal, goal_height_m
 from airl_mav.profiles.vehicle import CORNERS
 from airl_mav.report.export_log.foxglove_types import (
     UNTURNED,
@@ -67,13 +68,13 @@ Size = tuple[float, float, float]
 
 
 def arena_scene(
-    arena: Arena | None, goal: tuple[float, float], goal_radius_m: float, at: Timestamp
+    arena: Arena | None, goal: Goal, goal_radius_m: float, at: Timestamp
 ) -> SceneUpdate:
     """Return what stands still: floor, walls, obstacles, goal and start."""
     bounds = OPEN if arena is None else arena.bounds
     entities = [
         SceneEntity(timestamp=at, frame_id=WORLD, id="floor", cubes=[_floor(bounds)]),
-        _ends(goal, goal_radius_m, 0.6 * bounds.height, at),
+        _ends(goal, goal_radius_m, goal_height_m(goal) or 0.6 * bounds.height, at),
     ]
     if arena is not None:
         walls = SceneEntity(
@@ -212,15 +213,13 @@ def _walls(b: Bounds, rgb: Colour) -> list[CubePrimitive]:
     ]
 
 
-def _ends(
-    goal: tuple[float, float], radius_m: float, height_m: float, at: Timestamp
-) -> SceneEntity:
+def _ends(goal: Goal, radius_m: float, height_m: float, at: Timestamp) -> SceneEntity:
     """Return the goal with its pole and name, and the start."""
 
     def disc(north: float, east: float, radius: float, rgb: Colour) -> CylinderPrimitive:
         return _cylinder(np.array([north, east, -THIN_M]), radius, THIN_M, rgb, 0.45)
 
-    north, east = goal
+    north, east = goal[:2]
     pole = _cylinder(np.array([north, east, -0.5 * height_m]), 0.04, height_m, GOAL)
     name = TextPrimitive(
         pose=pose(np.array([north, east, -height_m - 0.4])),

@@ -60,8 +60,8 @@ class Cause:
 
 
 def straight_m(record: EpisodeRecord) -> float:
-    """Return the length of the straight way from the start to the goal's edge [m]."""
-    return max(0.1, math.hypot(*record.goal) - record.goal_radius_m)
+    """Return the length of the straight level way from the start to the goal's edge [m]."""
+    return max(0.1, math.hypot(*record.goal[:2]) - record.goal_radius_m)
 
 
 def usual_flight(records: tuple[EpisodeRecord, ...]) -> UsualFlight:

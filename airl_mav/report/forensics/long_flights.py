@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.footprints import bounding_boxes, segments_clear
 from airl_mav.core.constants import US_PER_S
+from airl_mav.core.goals import goal_distance_m
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory
@@ -81,11 +82,8 @@ def cause_of_long_flight(flight: Evidence, usual: UsualFlight) -> Cause:
 
 
 def _goal_distance(record: EpisodeRecord, part: Trajectory) -> NDArray[np.float64]:
-    """Return the distance from the goal (n,) [m], seen from above."""
-    away: NDArray[np.float64] = np.hypot(
-        part.position[:, 0] - record.goal[0], part.position[:, 1] - record.goal[1]
-    )
-    return away
+    """Return the distance from the goal (n,) [m]: seen from above, if it has no height."""
+    return np.array([goal_distance_m(record.goal, here) for here in part.position])
 
 
 def _approach(record: EpisodeRecord, part: Trajectory, start_us: int) -> str:
@@ -174,7 +172,7 @@ def _detour(flight: Evidence) -> Cause | None:
     if flight.arena is None or excess is None or excess < DETOUR_EXCESS:
         return None
     boxes = bounding_boxes(flight.arena.obstacles).grown(HALF_WIDTH_M)
-    free = bool(segments_clear(np.zeros(2), np.array([flight.record.goal]), boxes)[0])
+    free = bool(segments_clear(np.zeros(2), np.array([flight.record.goal[:2]]), boxes)[0])
     way = f"{1.0 + excess:.2f} times the straight way"
     if free:
         return Cause("a detour without need", (f"{way}, on which nothing stood at the start.",))

@@ -1,0 +1,156 @@
+"""Gates: walls across the arena with an opening, that the vehicle has to fly through.
+
+A gate is four boxes around its opening: west and east of it from the floor to the top, below and
+above it between these two. They are primitives as any other: bodies, images and contacts need to
+know nothing of gates.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.arena.appearance import Statics
+from airl_mav.arena.footprints import Boxes, Floats
+from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape
+from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.profiles.gates import GATE
+
+PARTS = 4
+"""Boxes of a gate, in this order: west and east of the opening, below and above it."""
+
+NUMBERS = 5
+"""Uniform numbers drawn for each gate."""
+
+
+@dataclass(frozen=True)
+class Openings:
+    """The openings of k gates, the southernmost first."""
+
+    center: Floats  # (k, 3) NED [m]
+    half_size: Floats  # (k, 3) half thickness of the wall, half width, half height [m]
+
+    def __len__(self) -> int:
+        """Return k."""
+        return len(self.center)
+
+
+def draw_openings(rng: np.random.Generator, spec: ArenaSpec) -> Openings:
+    """Draw the openings of an arena's gates, uniform within the ranges of `spec.gates`.
+
+    Nothing is drawn again: every draw fits, as the profile has been checked.
+    """
+    gates = spec.gates
+    k = int(rng.integers(*gates.count, endpoint=True))
+    numbers = rng.random((k, NUMBERS))
+
+    def within(column: int, limits: tuple[float, float]) -> Floats:
+        scaled: Floats = limits[0] + (limits[1] - limits[0]) * numbers[:, column]
+        return scaled
+
+    step = within(0, gates.spacing_m)
+    step[:1] = within(0, gates.first_m)[:1]
+    east, middle = within(1, gates.lateral_m), within(2, gates.middle_m)
+    width, height = within(3, gates.width_m), within(4, gates.height_m)
+    center = np.column_stack([np.cumsum(step), east, -middle])
+    thickness = np.full(k, gates.thickness_m)
+    return Openings(center, 0.5 * np.column_stack([thickness, width, height]))
+
+
+def frames(openings: Openings, bounds: Bounds) -> Obstacles:
+    """Return the boxes of gates, PARTS of each one after the other.
+
+    They reach from the west wall of `bounds` to the east wall, and from the floor to their top.
+    """
+    k = len(openings)
+    (north, east, down), (thick, wide, tall) = openings.center.T, openings.half_size.T
+    west_edge, east_edge, bottom, top = east - wide, east + wide, -down - tall, -down + tall
+    low, high = np.full(k, bounds.east_min), np.full(k, bounds.east_max)
+    floor, ceiling = np.zeros(k), np.full(k, bounds.height)
+    sides = [
+        (low, west_edge, floor, ceiling),
+        (east_edge, high, floor, ceiling),
+        (west_edge, east_edge, floor, bottom),
+        (west_edge, east_edge, top, ceiling),
+    ]
+    center, half_size = np.empty((k, PARTS, 3)), np.empty((k, PARTS, 3))
+    for part, (west, last, lower, upper) in enumerate(sides):
+        center[:, part] = np.column_stack([north, 0.5 * (west + last), -0.5 * (lower + upper)])
+        half_size[:, part] = np.column_stack([thick, 0.5 * (last - west), 0.5 * (upper - lower)])
+    return Obstacles(
+        shape=np.full(PARTS * k, Shape.BOX, np.int8),
+        center=center.reshape(-1, 3),
+        half_size=half_size.reshape(-1, 3),
+        yaw=np.zeros(PARTS * k),
+    )
+
+
+def with_gates(statics: Statics | None, standing: Obstacles, k: int) -> Statics | None:
+    """Return what the primitives are parts of, once k gates stand behind the others.
+
+    Args:
+        statics: Of the others; None: each is a thing of its own.
+        standing: The others.
+        k: Number of gates.
+    """
+    if k == 0:
+        return statics
+    if statics is None:
+        names = tuple(Shape(int(shape)).name.lower() for shape in standing.shape)
+        statics = Statics(names, np.arange(len(names)), (None,) * len(names))
+    things = len(statics.names)
+    return Statics(
+        names=statics.names + (GATE,) * k,
+        of=np.concatenate([statics.of, things + np.repeat(np.arange(k), PARTS)]),
+        materials=statics.materials + (None,) * (PARTS * k),
+    )
+
+
+def openings_of(arena: Arena) -> Openings:
+    """Return the openings of an arena's gates, as its bodies have them."""
+    first = np.flatnonzero(_part_of_gate(arena) == 0)
+    center, half = arena.obstacles.center, arena.obstacles.half_size
+    west, below, above = first, first + 2, first + 3
+    bottom = center[below, 2] - half[below, 2]
+    top = center[above, 2] + half[above, 2]
+    found = np.column_stack([center[west, 0], center[below, 1], 0.5 * (bottom + top)])
+    size = np.column_stack([half[west, 0], half[below, 1], 0.5 * (bottom - top)])
+    order = np.argsort(found[:, 0], kind="stable")
+    return Openings(found[order], size[order])
+
+
+def over_openings(arena: Arena) -> NDArray[np.bool_]:
+    """Return (n_static,) which primitives that stand are below or above the opening of a gate.
+
+    Seen from above, they lie where the vehicle flies through.
+    """
+    crossing: NDArray[np.bool_] = _part_of_gate(arena) >= 2
+    return crossing
+
+
+def _part_of_gate(arena: Arena) -> NDArray[np.int64]:
+    """Return (n_static,) which of the PARTS of a gate each primitive is; -1: of none."""
+    parts = np.full(arena.n_static, -1, np.int64)
+    boxes = PARTS * arena.n_gates
+    parts[arena.n_static - boxes :] = np.arange(boxes) % PARTS
+    return parts
+
+
+def closed_from_above(frame: Obstacles) -> Obstacles:
+    """Return of the boxes of gates those that close the way at any height: at the sides."""
+    keep = np.arange(len(frame)) % PARTS < 2
+    return Obstacles(frame.shape[keep], frame.center[keep], frame.half_size[keep], frame.yaw[keep])
+
+
+def behind(openings: Openings, bounds: Bounds, clearance_m: float) -> Boxes:
+    """Return the floor (one box, or none) that is not `clearance_m` [m] behind the last gate."""
+    if not len(openings):
+        return Boxes(np.zeros((0, 2)), np.zeros((0, 2)))
+    last = float((openings.center[:, 0] + openings.half_size[:, 0]).max()) + clearance_m
+    south, middle = bounds.north_min, 0.5 * (bounds.east_min + bounds.east_max)
+    wide = 0.5 * (bounds.east_max - bounds.east_min)
+    return Boxes(
+        np.array([[0.5 * (south + last), middle]]), np.array([[0.5 * (last - south), wide]])
+    )

@@ -1,0 +1,29 @@
+"""Where to fly: a place on the floor, or a point above it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+Goal = tuple[float, float] | tuple[float, float, float]
+"""North, east of the start [m]; where the goal has a height also down: above the start it is
+negative."""
+
+
+def goal_distance_m(goal: Goal, position: Sequence[float] | NDArray[np.float64]) -> float:
+    """Return how far a position NED (3,) [m] is from a goal: seen from above, if it has no height.
+
+    Args:
+        goal: Where to fly.
+        position: Of the vehicle.
+    """
+    away = math.hypot(position[0] - goal[0], position[1] - goal[1])
+    return away if len(goal) == 2 else math.hypot(away, position[2] - goal[2])
+
+
+def goal_height_m(goal: Goal) -> float | None:
+    """Return how high above the start a goal is [m]; None: it has no height."""
+    return None if len(goal) == 2 else -goal[2]
