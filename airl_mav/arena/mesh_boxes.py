@@ -183,15 +183,23 @@ def _read(path: Path) -> trimesh.Trimesh:
     if path.suffix.lower() not in FORMATS:
         raise FieldError("mesh", str(path), f"a file that ends in {', '.join(FORMATS)}")
     try:
-        mesh = trimesh.load(path, force="mesh")
+        # Its readers compare places that need not be numbers.
+        with np.errstate(all="ignore"):
+            mesh = trimesh.load(path, force="mesh")
     except OSError as error:
         raise UsageError(f"{path}: {error.strerror}") from None
     except Exception as error:  # what its readers raise for a damaged file is their own
-        raise UsageError(f"{path}: cannot be read as a mesh: {error}") from None
+        why = " ".join(str(error).split())
+        raise UsageError(f"{path}: cannot be read as a mesh: {why}") from None
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
         raise UsageError(f"{path}: holds no triangles")
-    if not np.isfinite(mesh.vertices).all():
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    if vertices.ndim != 2 or vertices.shape[1] != 3:
+        raise UsageError(f"{path}: its places do not have three coordinates each")
+    if not np.isfinite(vertices).all():
         raise UsageError(f"{path}: has places that are no numbers")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise UsageError(f"{path}: has triangles with corners that it does not have")
     return mesh
 
 

@@ -256,6 +256,20 @@ def test_what_is_no_mesh_for_an_asset_gets_one_line(tmp_path: Path) -> None:
         boxes_of_mesh(large)
 
 
+def test_a_damaged_mesh_that_its_reader_takes_gets_one_line(tmp_path: Path) -> None:
+    flat = tmp_path / "flat.obj"
+    flat.write_text("v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n", encoding="utf-8")
+    with pytest.raises(UsageError, match=r"flat\.obj: its places do not have three coordinates"):
+        boxes_of_mesh(flat)
+    whole = export(trimesh.creation.box(), tmp_path / "box.glb").read_bytes()
+    indices = np.asarray(trimesh.creation.box().faces, np.uint32).tobytes()
+    assert whole.count(indices) == 1
+    far = tmp_path / "far.glb"
+    far.write_bytes(whole.replace(indices, b"\xff\xff\xff\x0f" + indices[4:]))
+    with pytest.raises(UsageError, match=r"far\.glb: has triangles with corners that it does not"):
+        boxes_of_mesh(far)
+
+
 def test_the_command_writes_an_arena_that_stands_full_of_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
