@@ -20,12 +20,16 @@ from airl_mav.arena.footprints import bounding_boxes
 from airl_mav.arena.gates import openings_of, over_openings
 from airl_mav.arena.generate import free_area_fraction, generate
 from airl_mav.arena.geometry import Arena
-from airl_mav.core.errors import UsageError
+from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.goals import goal_distance_m
 from airl_mav.envs.arenas import batch_of
 from airl_mav.envs.contact import NOTHING, touches
+from airl_mav.policy.registry import find_policy
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
+from airl_mav.scenario.model import Scenario
+from airl_mav.scenario.piloting import check_goal_height
+from airl_mav.scenario.resolve import resolve
 from airl_mav.view.messages import ArenaShown
 
 WIDTH_M = 0.55
@@ -278,6 +282,17 @@ def test_gates_that_cannot_be_are_refused(
 def test_an_opening_that_the_vehicle_does_not_fit_through_is_refused(spec: ArenaSpec) -> None:
     with pytest.raises(UsageError, match=r"an opening of a gate is .* more than the vehicle's 3 m"):
         made(spec, 0, width_m=3.0)
+
+
+def test_a_policy_that_is_told_the_height_flies_only_where_there_is_one() -> None:
+    with pytest.raises(FieldError, match="a goal with a height, which policy gates is told") as no:
+        resolve(Scenario(policy="gates", arena="static-obstacles", level="gym"))
+    assert no.value.field == "arena"
+    goal = resolve(Scenario(policy="gates", arena="gates", level="gym")).arena_of(1).goal_point
+    assert len(goal) == 3
+    check_goal_height(find_policy("gates"), goal, "goal", "20 5 -4")
+    with pytest.raises(FieldError, match=r"goal.*20 5"):
+        check_goal_height(find_policy("gates"), (20.0, 5.0), "goal", "20 5")
 
 
 # --- how far the goal is
