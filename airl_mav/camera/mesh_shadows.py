@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.camera.bvh import STACK, Bvh, Meshes
-from airl_mav.camera.meshes import Faces, inverse_of, seen_from
+from airl_mav.camera.mesh_triangles import Faces
+from airl_mav.camera.meshes import inverse_of, seen_from
 from airl_mav.camera.primitives import OBSTACLE, SKY, Ids, Line, Lines
 from airl_mav.camera.projection import Pose, View, dot
 from airl_mav.camera.shading import F32, ZERO, Plane

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.appearance import OBSTACLE as OBSTACLE_ROW
 from airl_mav.camera.bvh import Meshes
-from airl_mav.camera.meshes import Faces
+from airl_mav.camera.mesh_triangles import Faces
 from airl_mav.camera.primitives import OBSTACLE, Ids, Line, Lines, Rectangles, turned
 from airl_mav.camera.projection import Pose
 from airl_mav.camera.shading import (

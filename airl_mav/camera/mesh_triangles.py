@@ -1,0 +1,176 @@
+"""A triangle of a mesh, drawn into a part of an image or met by a single ray.
+
+A triangle with the corners a, b and c, seen from the camera, is hit by the ray d where the volumes
+d.(b x c), d.(c x a) and d.(a x b) have one sign, but for rounding, so that no ray passes between
+two that share an edge or a corner: each is affine along a line of the image. The inverse depth is
+n.d / n.a with n = (b - a) x (c - a). Both sides are seen.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.camera.mesh_parts import NEAR, between, pixels
+from airl_mav.camera.primitives import Ids, Line, Lines
+from airl_mav.camera.projection import Image, Pose, Rectangle, View, dot
+from airl_mav.core.kernels import kernel
+from airl_mav.vehicle.rotation import Vec
+
+_SPARE: Final = 4e-14
+"""Of a volume in the square of the distance: above rounding, below a billionth of a metre."""
+
+_EDGE_ON2: Final = 1e-18
+"""Square of the angle below which a triangle is not seen."""
+
+Faces = NDArray[np.int32]
+"""The number of the triangle that each pixel sees."""
+
+
+@kernel
+def _cross(a: Vec, b: Vec) -> Vec:
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+
+
+class _Sides(NamedTuple):
+    """What a ray d is tested with against a triangle.
+
+    The volumes that it spans with the edges are d.n0, d.n1 and d.n2, where it is hit not below 0
+    but by `spare`, for rounding. The inverse depth is gain d.normal; a gain of 0: seen edge on.
+    """
+
+    n0: Vec
+    n1: Vec
+    n2: Vec
+    normal: Vec
+    gain: float
+    spare: float
+
+
+@kernel
+def _sides(p0: Vec, p1: Vec, p2: Vec) -> _Sides:
+    """Return what a ray is tested with against a triangle, by its corners from the camera."""
+    n0, n1, n2 = _cross(p1, p2), _cross(p2, p0), _cross(p0, p1)
+    volume = dot(p0, n0)
+    sign = 1.0 if volume > 0.0 else -1.0
+    normal = _cross(
+        (p1[0] - p0[0], p1[1] - p0[1], p1[2] - p0[2]), (p2[0] - p0[0], p2[1] - p0[1], p2[2] - p0[2])
+    )
+    height, away2 = dot(normal, p0), dot(p0, p0)
+    edge_on = height * height <= _EDGE_ON2 * dot(normal, normal) * away2
+    gain = 0.0 if edge_on else 1.0 / height
+    spare = _SPARE * (away2 + dot(p1, p1) + dot(p2, p2))
+    return _Sides(_signed(n0, sign), _signed(n1, sign), _signed(n2, sign), normal, gain, spare)
+
+
+@kernel
+def _signed(v: Vec, sign: float) -> Vec:
+    return (sign * v[0], sign * v[1], sign * v[2])
+
+
+@kernel
+def draw_triangle(
+    out: Image,
+    ids: Ids | None,
+    faces: Faces | None,
+    number: int,
+    lines: Lines,
+    xs: Line,
+    view: View,
+    pose: Pose,
+    corners: NDArray[np.float32],
+    i: int,
+    part: Rectangle,
+    per: float,
+) -> None:
+    """Draw a triangle into a part of the image; `per` is a metre in units of the mesh."""
+    c, f, r, d = pose.center, pose.forward, pose.along, pose.across
+    p0 = (c[0] + corners[i, 0], c[1] + corners[i, 1], c[2] + corners[i, 2])
+    p1 = (c[0] + corners[i, 3], c[1] + corners[i, 4], c[2] + corners[i, 5])
+    p2 = (c[0] + corners[i, 6], c[1] + corners[i, 7], c[2] + corners[i, 8])
+    least, most = 0.0, math.inf  # inverse depth of its corners
+    if not view.cylindrical:
+        z0, z1, z2 = dot(f, p0), dot(f, p1), dot(f, p2)
+        near, far = min(min(z0, z1), z2), max(max(z0, z1), z2)
+        if far <= 0.0:
+            return
+        if near > NEAR:
+            g0, g1, g2 = 1.0 / z0, 1.0 / z1, 1.0 / z2
+            least, most = min(min(g0, g1), g2), max(max(g0, g1), g2)
+            x0, x1, x2 = dot(r, p0) * g0, dot(r, p1) * g1, dot(r, p2) * g2
+            y0, y1, y2 = dot(d, p0) * g0, dot(d, p1) * g1, dot(d, p2) * g2
+            part = pixels(
+                view,
+                min(min(x0, x1), x2),
+                max(max(x0, x1), x2),
+                min(min(y0, y1), y2),
+                max(max(y0, y1), y2),
+                part,
+            )
+        else:
+            x0, x1, x2 = dot(r, p0), dot(r, p1), dot(r, p2)
+            y0, y1, y2 = dot(d, p0), dot(d, p1), dot(d, p2)
+            part = between(
+                view,
+                near,
+                far,
+                min(min(x0, x1), x2),
+                max(max(x0, x1), x2),
+                min(min(y0, y1), y2),
+                max(max(y0, y1), y2),
+                part,
+            )
+        if part[0] >= part[1] or part[2] >= part[3]:
+            return
+    sides = _sides(p0, p1, p2)
+    if sides.gain == 0.0:
+        return
+    slope0, slope1, slope2 = dot(sides.n0, r), dot(sides.n1, r), dot(sides.n2, r)
+    slope = dot(sides.normal, r)
+    for v in range(part[0], part[1]):
+        ahead, y = lines[v, 0], lines[v, 1]
+        ray = (ahead * f[0] + y * d[0], ahead * f[1] + y * d[1], ahead * f[2] + y * d[2])
+        start0, start1, start2 = dot(sides.n0, ray), dot(sides.n1, ray), dot(sides.n2, ray)
+        start = dot(sides.normal, ray)
+        for u in range(part[2], part[3]):
+            x = xs[u]
+            e0, e1, e2 = start0 + x * slope0, start1 + x * slope1, start2 + x * slope2
+            if min(min(e0, e1), e2) >= -sides.spare:
+                # Of a triangle seen edge on, rounding is kept within its corners.
+                s = min(max(sides.gain * (start + x * slope), least), most)
+                s32 = np.float32(per * s)
+                if s >= view.s_min and s32 > out[v, u]:
+                    out[v, u] = s32
+                    if ids is not None:
+                        ids[v, u] = number
+                    if faces is not None:
+                        faces[v, u] = i
+
+
+@kernel
+def met(
+    corners: NDArray[np.float32], i: int, view: View, pose: Pose, start: Vec, x: float
+) -> float:
+    """Return the inverse depth of a triangle along a ray, as `draw_triangle`; 0: it misses it."""
+    c, f, r = pose.center, pose.forward, pose.along
+    p0 = (c[0] + corners[i, 0], c[1] + corners[i, 1], c[2] + corners[i, 2])
+    p1 = (c[0] + corners[i, 3], c[1] + corners[i, 4], c[2] + corners[i, 5])
+    p2 = (c[0] + corners[i, 6], c[1] + corners[i, 7], c[2] + corners[i, 8])
+    sides = _sides(p0, p1, p2)
+    e0, e1, e2 = (
+        dot(sides.n0, start) + x * dot(sides.n0, r),
+        dot(sides.n1, start) + x * dot(sides.n1, r),
+        dot(sides.n2, start) + x * dot(sides.n2, r),
+    )
+    if sides.gain == 0.0 or min(min(e0, e1), e2) < -sides.spare:
+        return 0.0
+    s = sides.gain * (dot(sides.normal, start) + x * dot(sides.normal, r))
+    if not view.cylindrical:
+        z0, z1, z2 = dot(f, p0), dot(f, p1), dot(f, p2)
+        if min(min(z0, z1), z2) > NEAR:
+            g0, g1, g2 = 1.0 / z0, 1.0 / z1, 1.0 / z2
+            s = min(max(s, min(min(g0, g1), g2)), max(max(g0, g1), g2))
+    return s
