@@ -30,6 +30,7 @@ _EXPORTS = {
     "load_run": "airl_mav.experiments.run",
     "profile": "airl_mav.profiling.profile",
     "refit": "airl_mav.refitting.refit",
+    "refit_together": "airl_mav.refitting.together",
     "rehearse": "airl_mav.experiments.fly",
     "roofline": "airl_mav.experiments.roofline",
 }
@@ -47,6 +48,7 @@ if TYPE_CHECKING:
     from airl_mav.profiling.profile import profile
     from airl_mav.profiling.request import ProfileRequest
     from airl_mav.refitting.refit import refit
+    from airl_mav.refitting.together import refit_together
     from airl_mav.scenario.model import Scenario
 
 __all__ = [
@@ -62,6 +64,7 @@ __all__ = [
     "load_run",
     "profile",
     "refit",
+    "refit_together",
     "rehearse",
     "roofline",
 ]

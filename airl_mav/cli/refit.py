@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -10,6 +11,7 @@ from rich.console import Console
 
 from airl_mav.cli.options import POSITIONAL, check_installed
 from airl_mav.core.console import new_console
+from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel
 from airl_mav.report.table import NONE, Column, TableView, print_table
 
@@ -22,17 +24,21 @@ class RefitOptions(ProfileModel):
     """Fit a vehicle, a computer and the wind to a flight that --black-box has recorded.
 
     With the flight controller's log (.ulg) also mass or thrust, and the time on the link. A PX4 log
-    alone, of whatever flew the vehicle, tells all of that but the computer. Writes profiles that
-    load as they are, and says what the flight does not tell.
+    alone, of whatever flew the vehicle, tells all of that but the computer; several of them tell of
+    the vehicle more closely. Writes profiles that load as they are, and says what the flights do
+    not tell.
 
     Examples:
         airl refit log_12.ulg --vehicle quad --out refit
+        airl refit log_10.ulg log_11.ulg log_12.ulg --vehicle quad --out refit
         airl refit flights/20261123T172437.230467Z.mcap --ulg log_12.ulg --out refit
         airl refly flights/20261123T172437.230467Z.mcap --refit refit
     """
 
-    flight: Annotated[Path, POSITIONAL] = Field(
-        description="black box of a flight (.mcap), or the flight controller's log alone (.ulg)"
+    flights: Annotated[tuple[Path, ...], POSITIONAL] = Field(
+        min_length=1,
+        description="black box of a flight (.mcap), or the flight controller's log alone (.ulg);"
+        " logs of several flights of one vehicle, the newest last",
     )
     ulg: Path | None = Field(
         default=None,
@@ -56,6 +62,16 @@ class RefitOptions(ProfileModel):
 
 OPTIONS = RefitOptions
 
+SHORT = {
+    "mass_kg": "mass",
+    "thrust_max_n": "thrust",
+    "drag_1_s": "drag",
+    "wind_north_m_s": "wind north",
+    "wind_east_m_s": "wind east",
+    "dead_time_s": "dead time",
+}
+"""What a table of several flights shows of each, and what it calls that."""
+
 
 def run(options: RefitOptions, console: Console | None = None) -> int:
     """Refit. Returns exit status 0; raises UsageError as `refit` does."""
@@ -63,15 +79,25 @@ def run(options: RefitOptions, console: Console | None = None) -> int:
     check_installed("sim", "refit")
     # Imported here: MCAP and pyulog are extras.
     from airl_mav.refitting.refit import refit
+    from airl_mav.refitting.together import refit_together
 
-    found = refit(
-        options.flight,
-        ulg=options.ulg,
-        vehicle=options.vehicle,
-        known=options.known,
-        out=options.out,
-    )
+    if len(options.flights) > 1:
+        if options.ulg is not None:
+            raise FieldError("ulg", f"{options.ulg}", "nothing beside several logs")
+        found = refit_together(
+            options.flights, vehicle=options.vehicle, known=options.known, out=options.out
+        )
+    else:
+        found = refit(
+            options.flights[0],
+            ulg=options.ulg,
+            vehicle=options.vehicle,
+            known=options.known,
+            out=options.out,
+        )
     print_table(table_of(found), console)
+    if found.flights:
+        print_table(table_of_flights(found.flights), console)
     for line in (*unobserved_lines(found), *found.notes, f"written: {options.out}"):
         console.print(line, highlight=False, soft_wrap=True)
     return 0
@@ -99,10 +125,28 @@ def table_of(found: Refit) -> TableView:
     return TableView("refit", f"{found.base}, refitted", columns, rows)
 
 
+def table_of_flights(flights: Sequence[Refit]) -> TableView:
+    """Return what each of several flights tells of the vehicle and its own wind."""
+    told = [key for key in SHORT if any(each.estimate(key).observed for each in flights)]
+    columns = (
+        Column("flight", number=False),
+        *(Column(SHORT[key], flights[0].estimate(key).unit) for key in told),
+    )
+    rows = tuple(
+        (
+            "" if each.ulg is None else each.ulg.name,
+            *(_number(each.estimate(key), each.estimate(key).value) for key in told),
+        )
+        for each in flights
+    )
+    return TableView("flights", "Each flight alone", columns, rows)
+
+
 def unobserved_lines(found: Refit) -> list[str]:
     """Return a line for each quantity that the flight does not tell."""
     return [
-        f"not observable in this flight: {each.meaning}: {each.unobservable}"
+        f"not observable{' in this flight' if not found.flights else ''}: {each.meaning}:"
+        f" {each.unobservable}"
         for each in found.estimates
         if not each.observed
     ]

@@ -58,6 +58,8 @@ class Refit:
     air: Air
     latencies: Latencies
     notes: tuple[str, ...]
+    flights: tuple[Refit, ...] = ()
+    """What each tells alone, where several were fitted together."""
 
     @property
     def estimates(self) -> tuple[FittedQuantity, ...]:
@@ -76,21 +78,29 @@ class Refit:
 
     def as_json(self) -> dict[str, Any]:
         """Return it as `refit.json` has it."""
+        flights = [each._told() for each in self.flights]
+        return {
+            "schema": SCHEMA,
+            **self._told(),
+            "overrides": [asdict(each) for each in self.overrides],
+            "notes": list(self.notes),
+            "versions": package_versions(),
+            **({"flights": flights} if flights else {}),
+        }
+
+    def _told(self) -> dict[str, Any]:
+        """Return what a flight tells, or all of them together."""
         wind = self.air.wind
         estimates = {each.key: asdict(each) for each in self.estimates}
         for fields in estimates.values():
             del fields["key"]
         return {
-            "schema": SCHEMA,
             "black_box": None if self.black_box is None else str(self.black_box),
             "ulg": None if self.ulg is None else str(self.ulg),
             "vehicle": self.base,
             "known": self.known,
             "estimates": estimates,
             "wind": None if wind is None else {"north_m_s": wind[0], "east_m_s": wind[1]},
-            "overrides": [asdict(each) for each in self.overrides],
-            "notes": list(self.notes),
-            "versions": package_versions(),
         }
 
 
@@ -121,8 +131,7 @@ def refit(
         UsageError: A file cannot be read, or holds no navigation, or the log is of another flight,
             or alone and of none. `FieldError`s name the field.
     """
-    if out is not None and out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise FieldError("out", f"{out}", "a new or empty folder: it holds something else")
+    check_out(out)
     box: BlackBox | None = None
     if path.suffix.lower() == LOG_SUFFIX:
         if ulg is not None:
@@ -163,6 +172,12 @@ def refit(
     if out is not None:
         _write(found, box, board, out)
     return found
+
+
+def check_out(out: Path | None) -> None:
+    """Refuse a folder that holds something. Raises FieldError."""
+    if out is not None and out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise FieldError("out", f"{out}", "a new or empty folder: it holds something else")
 
 
 def _board(name: str) -> tuple[ComputerProfile, tuple[str, ...]]:

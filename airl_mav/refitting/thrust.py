@@ -15,6 +15,7 @@ from typing import Literal
 import numpy as np
 
 from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S
+from airl_mav.flight.statistics import QUANTILE
 from airl_mav.profiles.vehicle import CORNERS, VehicleProfile
 from airl_mav.refitting.air import SETTLED_SHARE, Air
 from airl_mav.refitting.flown import Flown
@@ -23,9 +24,6 @@ from airl_mav.vehicle_log.ulog import VehicleLog
 
 Known = Literal["thrust", "mass"]
 """Which of the two the profile is right about."""
-
-DEVIATIONS = 1.96
-"""Standard deviations from the mean to the ends of a 95 % interval."""
 
 LEAST_SAMPLES = 20
 WIDEST = 0.15
@@ -60,7 +58,18 @@ def fit_thrust(
     """
     ratio = vehicle.thrust_n / vehicle.body.mass_kg
     blank = unobserved("thrust_per_mass_m_s2", "thrust per mass", "m/s²", "", ratio)
-    found = _ratio(flown, vehicle, air, blank, rng)
+    return thrust_of(_ratio(flown, vehicle, air, blank, rng), vehicle, known)
+
+
+def thrust_of(found: FittedQuantity, vehicle: VehicleProfile, known: Known) -> Thrust:
+    """Return what the greatest thrust per mass says of a vehicle.
+
+    Args:
+        found: Thrust per mass [m/s²].
+        vehicle: As it was thought to be, with all that it carries.
+        known: Which of mass and thrust is taken from the profile.
+    """
+    ratio = vehicle.thrust_n / vehicle.body.mass_kg
     values = found.value, found.low, found.high
     if found.value is None:
         why = found.unobservable
@@ -126,7 +135,7 @@ def _ratio(
     # The ratio's error by its linearisation: that of the mean of what is left over.
     left = carried - value * shared
     low, high = mean_interval(left, felt.time_us / US_PER_S, rng)
-    bias_m_s2 = DEVIATIONS * SETTLED_SHARE * vehicle.sensors.imu.accel_bias_m_s2
+    bias_m_s2 = QUANTILE * SETTLED_SHARE * vehicle.sensors.imu.accel_bias_m_s2
     low, high = -math.hypot(low, bias_m_s2), math.hypot(high, bias_m_s2)
     low, high = (value + end / float(shared.mean()) for end in (low, high))
     if 0.5 * (high - low) > WIDEST * value:

@@ -35,6 +35,7 @@ from airl_mav.profiles.conditions import WindSettings
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.refitting.flown import flown_of
 from airl_mav.refitting.refit import Refit, refit
+from airl_mav.refitting.together import refit_together
 from airl_mav.rehearsal.run_folder import load
 from airl_mav.report.recording_folder import take_in
 from airl_mav.report.tracking import track
@@ -132,6 +133,27 @@ def test_the_black_box_alone_tells_what_it_can(refitted: Refitted) -> None:
     assert alone is not None and with_log is not None
     # Alone, the link's time is a part of it.
     assert alone - with_log == pytest.approx(uplink_s(refitted.flight), abs=0.015)
+
+
+def test_two_logs_tell_of_the_vehicle_together(refitted: Refitted, tmp_path: Path) -> None:
+    """The same log twice: the same values, known better by the square root of two."""
+    again = tmp_path / "again.ulg"
+    again.write_bytes(refitted.flight.ulg.read_bytes())
+    alone = refit(refitted.flight.ulg)
+    out = tmp_path / "out"
+    both = refit_together([refitted.flight.ulg, again], out=out)
+    for key in ("mass_kg", "drag_1_s"):
+        one, two = alone.estimate(key), both.estimate(key)
+        assert one.value is not None and one.half_width is not None
+        assert two.value == pytest.approx(one.value, rel=1e-3)
+        assert two.half_width == pytest.approx(one.half_width / np.sqrt(2.0), rel=0.02)
+    assert both.air.wind is None and len(both.flights) == 2
+    assert both.flights[0].air.wind == both.flights[1].air.wind
+    assert both.flights[0].air.wind is not None
+    assert load_vehicle(str(out / "vehicle.toml")).body.mass_kg == both.vehicle.body.mass_kg
+    assert "wind" not in read_scenario_file(out / "scenario.toml")
+    held = json.loads((out / "refit.json").read_text(encoding="utf-8"))
+    assert [Path(each["ulg"]).name for each in held["flights"]] == ["flight.ulg", "again.ulg"]
 
 
 def test_the_vehicles_log_alone_tells_all_but_the_computer(
@@ -254,7 +276,7 @@ def test_the_command_prints_what_was_found_and_what_was_not(
     other: RecordedFlight, tmp_path: Path
 ) -> None:
     console = Console(file=StringIO(), record=True, width=140)
-    options = RefitOptions(flight=other.black_box, out=tmp_path / "out")
+    options = RefitOptions(flights=(other.black_box,), out=tmp_path / "out")
     assert airl_refit(options, console) == 0
     text = console.export_text()
     assert "velocity's time constant" in text

@@ -1,0 +1,132 @@
+"""A vehicle's profile from several flights' logs together.
+
+Each flight is fitted alone; what it tells of the vehicle is then averaged. Flights of one vehicle
+differ by more than their intervals say, so the mean is that of a random-effects model: a flight's
+value differs from the vehicle's by its own error, and by a spread that all of them share
+(DerSimonian and Laird, Meta-analysis in clinical trials, Controlled Clinical Trials 7, 1986).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from airl_mav.core.errors import FieldError
+from airl_mav.flight.statistics import QUANTILE
+from airl_mav.profiles.vehicle import load_vehicle
+from airl_mav.refitting.air import Air
+from airl_mav.refitting.files import vehicle_toml, write_refit
+from airl_mav.refitting.latencies import no_latencies
+from airl_mav.refitting.overrides import overrides_of, refitted
+from airl_mav.refitting.quantity import FittedQuantity, unobserved
+from airl_mav.refitting.refit import LOG_SUFFIX, Refit, check_out, refit
+from airl_mav.refitting.response import ResponseFit
+from airl_mav.refitting.thrust import Known, thrust_of
+from airl_mav.vehicle_log.ulog import read_vehicle_log
+
+OWN_WIND = "each flight has its own"
+
+
+def refit_together(
+    logs: Sequence[Path],
+    *,
+    vehicle: str | None = None,
+    known: Known = "thrust",
+    out: Path | None = None,
+    seed: int = 1,
+) -> Refit:
+    """Fit what the logs of several flights say of the vehicle that all of them flew.
+
+    Args:
+        logs: The vehicle's logs (.ulg), two or more, the newest last: of that one gains are taken.
+        vehicle: Profile to refit: a shipped name, or a path; None: `quad`.
+        known: What the profile is right about: a flight tells only the greatest thrust per mass.
+        out: New folder for `vehicle.toml`, `scenario.toml` and `refit.json`; None: nothing is
+            written.
+        seed: Draws the resamples of the intervals.
+
+    Raises:
+        UsageError: A file cannot be read, or is the log of no flight. `FieldError`s name the field.
+    """
+    check_out(out)
+    for path in logs:
+        if path.suffix.lower() != LOG_SUFFIX:
+            accepted = "vehicle's logs (.ulg) where there are several; a black box (.mcap) alone"
+            raise FieldError("flights", f"{path}", accepted)
+    if len(set(logs)) < len(logs):
+        raise FieldError("flights", f"{logs[0]}...", "each log once")
+    flights = tuple(refit(path, vehicle=vehicle, known=known, seed=seed) for path in logs)
+    base = flights[0].base
+    profile = load_vehicle(base)
+    response = ResponseFit(
+        *(
+            pooled([getattr(each.response, name) for each in flights])
+            for name in ("dead_time_s", "velocity_time_s", "yaw_rate_time_s")
+        )
+    )
+    thrust = thrust_of(pooled([each.thrust.ratio_m_s2 for each in flights]), profile, known)
+    winds = [
+        unobserved(each.key, each.meaning, each.unit, OWN_WIND, None)
+        for each in (flights[0].air.wind_north_m_s, flights[0].air.wind_east_m_s)
+    ]
+    drag = pooled([each.air.drag_1_s for each in flights])
+    air = Air(drag, winds[0], winds[1], flights[0].air.quadratic_1_m)
+    logged = [read_vehicle_log(path).parameters for path in logs]
+    overrides = overrides_of(profile, profile, response, thrust, air, logged[-1])
+    changed = sorted(
+        each.key
+        for each in overrides
+        if each.table == "parameters" and len({held.get(each.key) for held in logged}) > 1
+    )
+    notes = [f"fitted to {len(logs)} flights together; a flight's wind is its own"]
+    if changed:
+        notes.append(f"of {logs[-1].name}, as other logs have others: {', '.join(changed)}")
+    found = Refit(
+        black_box=None,
+        ulg=None,
+        base=base,
+        known=known,
+        vehicle=refitted(profile, overrides),
+        overrides=overrides,
+        response=response,
+        thrust=thrust,
+        air=air,
+        latencies=no_latencies(),
+        notes=tuple(notes),
+        flights=flights,
+    )
+    if out is not None:
+        remarks = (f"airl refit {' '.join(path.name for path in logs)}", *notes)
+        description = f"{base}, refitted to {len(logs)} flights"
+        text = vehicle_toml(base, description, overrides, remarks)
+        write_refit(out, found.as_json(), text, None, (), remarks)
+    return found
+
+
+def pooled(alone: Sequence[FittedQuantity]) -> FittedQuantity:
+    """Return a quantity of a vehicle, by what several flights tell of it."""
+    told = [each for each in alone if each.value is not None and each.half_width]
+    if not told:
+        return replace(alone[0], unobservable=f"in none of {len(alone)}: {alone[0].unobservable}")
+    values = np.array([each.value for each in told])
+    sigma = np.array([each.half_width for each in told]) / QUANTILE
+    value, error = random_effects(values, sigma)
+    half = QUANTILE * error
+    source = f"{len(told)} of {len(alone)} flights: {told[0].source}"
+    return replace(told[0], value=value, low=value - half, high=value + half, source=source)
+
+
+def random_effects(values: np.ndarray, sigma: np.ndarray) -> tuple[float, float]:
+    """Return mean and standard error of values (n,) with standard deviations (n,)."""
+    weight = sigma**-2.0
+    mean = float(np.sum(weight * values) / np.sum(weight))
+    spread = float(np.sum(weight * (values - mean) ** 2)) - (len(values) - 1)
+    scale = float(np.sum(weight) - np.sum(weight**2) / np.sum(weight))
+    between = max(0.0, spread / scale) if len(values) > 1 else 0.0
+    weight = 1.0 / (sigma**2 + between)
+    total = float(np.sum(weight))
+    return float(np.sum(weight * values) / total), math.sqrt(1.0 / total)
