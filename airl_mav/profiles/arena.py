@@ -207,18 +207,24 @@ class ArenaSpec(ProfileModel):
 
     @model_serializer(mode="wrap")
     def _without_unused(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out what says nothing: an arena's digest is that of before there was a choice."""
+        """Leave out what says nothing: an arena's digest is that of before there was a choice.
+
+        Some of it is gone already where what is None, or as it is by default, is left out.
+        """
         data: dict[str, Any] = dump(self)
+        silent: list[str] = []
         if self.generator == OBSTACLES and not self.options:
-            del data["generator"], data["options"]
+            silent += ["generator", "options"]
         if self.appearance == DEFAULT:
-            del data["appearance"]
+            silent.append("appearance")
         if not self.assets and self.asset_scale == (1.0, 1.0):
-            del data["assets"], data["asset_scale"]
+            silent += ["assets", "asset_scale"]
         if self.gates == Gates():
-            del data["gates"]
+            silent.append("gates")
+        for name in silent:
+            data.pop(name, None)
         if self.goal.height_m is None:
-            del data["goal"]["height_m"]
+            data.get("goal", {}).pop("height_m", None)
         return data
 
     @property

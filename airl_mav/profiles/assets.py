@@ -109,7 +109,7 @@ class Asset(ProfileModel):
         """Leave out a mesh where there is none: the arena's digest is that of before there were."""
         data: dict[str, Any] = dump(self)
         if self.mesh is None:
-            del data["mesh"]
+            data.pop("mesh", None)  # gone already where what is None is left out
         return data
 
     @property

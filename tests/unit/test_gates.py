@@ -303,3 +303,14 @@ def test_distances_to_a_goal() -> None:
     assert goal_distance_m((3.0, 4.0, -2.0), (0.0, 0.0, -14.0)) == pytest.approx(13.0)
     assert goal_distance_m((0.0, 0.0, -2.0), (0.0, 0.0, -2.0)) == 0.0
     assert math.isclose(goal_distance_m((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)), math.sqrt(2.0))
+
+
+@pytest.mark.parametrize("name", ["static-obstacles", "gates", "park"])
+def test_an_arena_is_the_same_after_any_dump(name: str) -> None:
+    spec = load_profile("arenas", name, ArenaSpec)
+    for data in (
+        spec.model_dump(mode="json", exclude_none=True),
+        spec.model_dump(mode="json", exclude_defaults=True),
+        spec.model_dump(mode="json", exclude_unset=True),
+    ):
+        assert ArenaSpec.model_validate(data) == spec
