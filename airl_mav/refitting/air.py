@@ -56,7 +56,7 @@ SETTLED_SHARE = 0.4
 
 LEARNT_SHARE = 0.6
 """What is left of it in what the estimator has corrected until the flight's end. Chosen on the
-first twenty flights of benchmarks/bench_refit.py and twelve of PX4 1.16."""
+first twenty flights of benchmarks/bench_refit.py and 24 of PX4 1.16."""
 
 BY_RATE_M_S = 0.1
 """How much of a rate the accelerometer may feel as acceleration [m/s² for 1 rad/s]: a thrust of 1 g
