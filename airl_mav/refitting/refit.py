@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -58,6 +59,8 @@ class Refit:
     air: Air
     latencies: Latencies
     notes: tuple[str, ...]
+    parameters: Mapping[str, float]
+    """Of the flight controller, as its log has them; empty without one."""
     flights: tuple[Refit, ...] = ()
     """What each tells alone, where several were fitted together."""
 
@@ -151,9 +154,8 @@ def refit(
     air = fit_air(flown, flying, streams[0])
     thrust = fit_thrust(flown, flying, air, known, streams[1])
     response = fit_response(flown, profile.response, streams[2])
-    overrides = overrides_of(
-        profile, flying, response, thrust, air, {} if flown.log is None else flown.log.parameters
-    )
+    parameters = {} if flown.log is None else flown.log.parameters
+    overrides = overrides_of(profile, flying, response, thrust, air, parameters)
     found = Refit(
         black_box=None if box is None else path,
         ulg=ulg,
@@ -168,6 +170,7 @@ def refit(
         if box is None
         else fit_latencies(stamps_of(box.all_of(Decision)), flown.clocks, streams[3]),
         notes=(*remarks, *_notes(flown, box, board)),
+        parameters=parameters,
     )
     if out is not None:
         _write(found, box, board, out)

@@ -22,11 +22,10 @@ from airl_mav.refitting.air import Air
 from airl_mav.refitting.files import vehicle_toml, write_refit
 from airl_mav.refitting.latencies import no_latencies
 from airl_mav.refitting.overrides import overrides_of, refitted
-from airl_mav.refitting.quantity import FittedQuantity, unobserved
+from airl_mav.refitting.quantity import Array, FittedQuantity, unobserved
 from airl_mav.refitting.refit import LOG_SUFFIX, Refit, check_out, refit
 from airl_mav.refitting.response import ResponseFit
 from airl_mav.refitting.thrust import Known, thrust_of
-from airl_mav.vehicle_log.ulog import read_vehicle_log
 
 OWN_WIND = "each flight has its own"
 
@@ -75,12 +74,13 @@ def refit_together(
     ]
     drag = pooled([each.air.drag_1_s for each in flights])
     air = Air(drag, winds[0], winds[1], flights[0].air.quadratic_1_m)
-    logged = [read_vehicle_log(path).parameters for path in logs]
-    overrides = overrides_of(profile, profile, response, thrust, air, logged[-1])
+    parameters = flights[-1].parameters
+    overrides = overrides_of(profile, profile, response, thrust, air, parameters)
     changed = sorted(
         each.key
         for each in overrides
-        if each.table == "parameters" and len({held.get(each.key) for held in logged}) > 1
+        if each.table == "parameters"
+        and len({flight.parameters.get(each.key) for flight in flights}) > 1
     )
     notes = [f"fitted to {len(logs)} flights together; a flight's wind is its own"]
     if changed:
@@ -97,6 +97,7 @@ def refit_together(
         air=air,
         latencies=no_latencies(),
         notes=tuple(notes),
+        parameters=parameters,
         flights=flights,
     )
     if out is not None:
@@ -120,7 +121,7 @@ def pooled(alone: Sequence[FittedQuantity]) -> FittedQuantity:
     return replace(told[0], value=value, low=value - half, high=value + half, source=source)
 
 
-def random_effects(values: np.ndarray, sigma: np.ndarray) -> tuple[float, float]:
+def random_effects(values: Array, sigma: Array) -> tuple[float, float]:
     """Return mean and standard error of values (n,) with standard deviations (n,)."""
     weight = sigma**-2.0
     mean = float(np.sum(weight * values) / np.sum(weight))
