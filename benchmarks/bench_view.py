@@ -1,8 +1,9 @@
-"""The view in a browser: update rates, memory, replay, and what a watcher costs.
+"""The view in a browser: update rates, memory and replay.
 
-Run as `python benchmarks/bench_view.py [live memory replay flights training]`; without words, all
-of them. It needs a Chromium, which draws in software unless it has a GPU: what it takes is then
-taken from everything else on the machine, whose load stands in the first line.
+Run as `python benchmarks/bench_view.py [live memory replay]`; without words, all of them. What a
+watcher costs those who fly and learn is measured by `bench_watched.py`. It needs a Chromium, which
+draws in software unless it has a GPU: what it takes is then taken from everything else on the
+machine, whose load stands in the first line.
 
 live      A flight of 31 vehicle states and 10 images a second reaches the page by the view's
           own process. Counted on the page: updates of the vehicle's pose and of the camera's image
@@ -13,25 +14,19 @@ memory    Half an hour of flights of a minute each, sent thirty times as fast: g
 replay    `airl view` of a run of 100 flights: from the command to the flight on the page, how long
           a moment takes to be drawn by the server, and updates a second while the slider is
           dragged.
-flights   Pairs of the same lockstep flight, alone and with a page that watches: fingerprints, and
-          wall time at full speed. Pairs at level sitl: t2 and how late the vehicle's ticks were.
-training  Pairs of the same short training, alone and watched: weights, and wall time.
 """
 
 from __future__ import annotations
 
 import argparse
-import gc
-import hashlib
 import os
 import statistics
 import subprocess
 import sys
 import tempfile
 import time
-import zipfile
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -50,8 +45,6 @@ from airl_mav.core.frames import quat_from_euler  # noqa: E402
 from airl_mav.profiles.arena import ArenaSpec  # noqa: E402
 from airl_mav.profiles.loading import load_profile  # noqa: E402
 from airl_mav.profiles.vehicle import load_vehicle  # noqa: E402
-from airl_mav.scenario.model import Scenario  # noqa: E402
-from airl_mav.scenario.resolve import resolve  # noqa: E402
 from airl_mav.view.ends import ViewEnds  # noqa: E402
 from airl_mav.view.feed import Feed  # noqa: E402
 from airl_mav.view.handshake import Request  # noqa: E402
@@ -66,7 +59,6 @@ from airl_mav.view.messages import (  # noqa: E402
 )
 from airl_mav.view.viewer import Viewer  # noqa: E402
 from tests.support.browser import Page, browser  # noqa: E402
-from tests.support.processes import SITL_WITHOUT_REPORT  # noqa: E402
 
 VEHICLE_US, PICTURE_US, DECISION_US = 32_000, 96_000, 512_000
 """Between two states, images and decisions of the flight [simulated µs]."""
@@ -433,140 +425,10 @@ def measure_drawing(run: Path) -> None:
     )
 
 
-def measure_flights(folder: Path, pairs: int = 4) -> None:
-    from airl_mav.lockstep.flight import fly
-
-    resolved = resolve(
-        Scenario(policy="static-obstacles", level="lockstep", time_limit_s=60.0, speed=None)
-    )
-
-    def lockstep(ends: ViewEnds | None) -> tuple[float, str]:
-        gc.collect()
-        began = time.monotonic()
-        record = fly(resolved, resolved.fresh_policy(11), 0, 11, view=ends).record
-        return time.monotonic() - began, str(record.sha256)
-
-    lockstep(None)
-    request = Request(run="bench", port=None, paced=True, speed=None, steerable=True,
-                      compensable=False, compensated=False)  # fmt: skip
-    with closing(Viewer(request)) as viewer, ExitStack() as held:
-        unseen = [(lockstep(None), lockstep(viewer.ends)) for _ in range(pairs)]
-        page = held.enter_context(browser(folder))
-        page.resize(900, 600)
-        page.open(viewer.url)
-        wait_for(lambda: "phase" in page.text())
-        seen = [(lockstep(None), lockstep(viewer.ends)) for _ in range(pairs)]
-    digests = {sha for pair in (*unseen, *seen) for _, sha in pair}
-    for name, rows in (("with --view, nobody there", unseen), ("with a page", seen)):
-        ratio = statistics.median(watched[0] / alone[0] for alone, watched in rows)
-        say(f"lockstep at full speed, {name}: {ratio:.2f} times the wall time of alone"
-            f" ({rows[0][0][0]:.2f} s); {load()}")  # fmt: skip
-    say(f"fingerprints of all {4 * pairs} flights: {'the same' if len(digests) == 1 else digests}")
-    measure_sitl(folder)
-
-
-def measure_sitl(folder: Path, pairs: int = 2) -> None:
-    """Two flights at level sitl alone, two watched, in turn."""
-    rows: dict[str, list[tuple[float, float, float]]] = {"alone": [], "watched": []}
-    for k in range(pairs):
-        for name in rows:
-            out = folder / f"sitl-{name}-{k}"
-            words = [sys.executable, *SITL_WITHOUT_REPORT, "--episodes", "1", "--seed", "11"]
-            words += ["--out", str(out), "--policy", "static-obstacles"]
-            with ExitStack() as held:
-                process = subprocess.Popen(  # noqa: S603
-                    words + (["--view"] if name == "watched" else []),
-                    cwd=ROOT,
-                    stdout=subprocess.PIPE,
-                    stderr=subprocess.STDOUT,
-                    text=True,
-                )
-                assert process.stdout is not None
-                if name == "watched":
-                    line = next(each for each in process.stdout if "view" in each)
-                    profile = folder / f"browser-{k}"
-                    profile.mkdir()
-                    page = held.enter_context(browser(profile))
-                    page.resize(900, 600)
-                    page.open(line.split()[-1])
-                process.stdout.read()
-                process.wait()
-            rows[name].append(of_sitl(out))
-    for name, found in rows.items():
-        median, worst, slip = np.array(found).mean(axis=0)
-        say(
-            f"sitl, {name}: t2 median {median:.2f} ms, greatest {worst:.1f} ms; simulated time"
-            f" given up {slip:.1f} ms a flight; {load()}"
-        )
-
-
-def of_sitl(out: Path) -> tuple[float, float, float]:
-    """Return median and greatest t2 of a run's flight, and the time that its host gave up [ms]."""
-    from airl_mav.rehearsal.run_folder import load as load_run
-
-    run = load_run(out)
-    (record,) = run.episodes
-    stamps = run.latency[record.index]
-    t2_us = stamps["action_ready_us"] - stamps["infer_start_us"]
-    return float(np.median(t2_us)) / 1e3, float(t2_us.max()) / 1e3, record.slipped_us / 1e3
-
-
-TRAINING = """
-description = "a short one"
-steps = 6_000
-vehicles = 32
-[environment]
-arena = "dynamic-obstacles"
-[algorithm]
-learning_starts = 500
-[selection]
-every = 100_000
-episodes = 1
-"""
-
-
-def measure_training(folder: Path, pairs: int = 3) -> None:
-    (folder / "bench.toml").write_text(TRAINING, encoding="utf-8")
-    ratios, weights = [], set()
-    with viewed() as viewer:
-        for k in range(pairs + 1):
-            took = {}
-            for ends in (None, viewer.ends):
-                out = folder / f"train-{k}-{ends is not None}"
-                # A process each: what one has compiled, allocated and cached is not the other's.
-                words = [sys.executable, __file__, "--train", str(folder / "bench.toml"), str(out)]
-                words += [] if ends is None else [ends.model_dump_json()]
-                done = subprocess.run(words, check=True, stdout=subprocess.PIPE, text=True)  # noqa: S603
-                wall, cpu = map(float, done.stdout.split()[-2:])
-                took[ends is not None] = wall, cpu
-                with zipfile.ZipFile(out / "best" / "model.zip") as saved:
-                    weights.add(hashlib.sha256(saved.read("policy.pth")).hexdigest())
-            if k:  # the first pair compiles
-                ratios.append((took[True][0] / took[False][0], took[True][1] / took[False][1]))
-    wall, cpu = np.median(np.array(ratios), axis=0)
-    say(
-        f"training, watched: {wall:.3f} times the wall time, {cpu:.3f} times the processor time;"
-        f" weights {'the same' if len(weights) == 1 else 'DIFFER'}; {load()}"
-    )
-
-
-def train(config: str, out: str, ends: str | None) -> None:
-    """Train once, and print wall and processor time."""
-    from airl_mav.training.config import TrainingConfig
-    from airl_mav.training.run import train as learn
-
-    view = None if ends is None else ViewEnds.model_validate_json(ends)
-    wall, cpu = time.monotonic(), time.process_time()
-    learn(load_profile("training", config, TrainingConfig), Path(out), name="bench", view=view)
-    print(time.monotonic() - wall, time.process_time() - cpu)
-
-
 MEASURES = {
     "live": measure_live,
     "memory": measure_memory,
     "replay": measure_replay,
-    "flights": measure_flights,
-    "training": measure_training,
 }
 
 
@@ -576,15 +438,11 @@ def main() -> None:
     )
     parser.add_argument("what", nargs="*", choices=[*MEASURES, []], help="by default all")
     parser.add_argument("--fly", nargs=3, help=argparse.SUPPRESS)
-    parser.add_argument("--train", nargs="+", help=argparse.SUPPRESS)
     asked = parser.parse_args()
     if asked.fly:
         ends, seconds, speed = asked.fly
         with closing(Feed(ViewEnds.model_validate_json(ends))) as feed:
             Circle().fly(feed, float(seconds), float(speed))
-        return
-    if asked.train:
-        train(*asked.train, *[None] * (3 - len(asked.train)))
         return
     say(load())
     for name in asked.what or MEASURES:

@@ -6,6 +6,8 @@ import ctypes
 import os
 import platform
 import sys
+from contextlib import suppress
+from pathlib import Path
 
 SLICE_NS = 100_000
 """Linux' shortest time slice [ns]."""
@@ -43,3 +45,21 @@ def ask_for_short_slices() -> None:
     asked = _Attributes(ctypes.sizeof(_Attributes), 0, 0, nice, 0, SLICE_NS, 0, 0)
     # Refused or not known: nothing depends on it.
     ctypes.CDLL(None).syscall(number, 0, ctypes.byref(asked), 0)
+
+
+def give_way(niceness: int) -> None:
+    """Let all others run before this process and what it starts from now on.
+
+    Linux' autogroups share the processor out among sessions, and niceness counts only within one:
+    a nice process of one session takes half of what an urgent one of another could have. So this
+    process becomes a session of its own, and is nice as such, too (sched(7)).
+
+    Args:
+        niceness: 1 to 19, the most.
+    """
+    os.nice(niceness)
+    with suppress(OSError):  # It leads its process group already, and perhaps its session.
+        os.setsid()
+    if os.getsid(0) == os.getpid():
+        with suppress(OSError):  # There are no autogroups here.
+            Path("/proc/self/autogroup").write_text(str(niceness), "ascii")

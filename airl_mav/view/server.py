@@ -16,6 +16,7 @@ import viser
 
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
+from airl_mav.core.scheduling import give_way
 from airl_mav.view.controls import Controls
 from airl_mav.view.feed import Ends
 from airl_mav.view.handshake import Answer, Request
@@ -90,7 +91,7 @@ def main() -> int:
     # What libraries print must not reach the harness as an answer.
     os.dup2(2, 1)
     request = Request.model_validate_json(sys.stdin.buffer.readline())
-    os.nice(NICENESS)
+    give_way(NICENESS)
     warnings.simplefilter("ignore", DeprecationWarning)
     server = LocalServer(request.port or 0)
     port = server.get_port()

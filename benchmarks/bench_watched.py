@@ -1,0 +1,268 @@
+"""What a watcher costs those who fly and learn: pairs of the same run, alone and watched.
+
+Run as `python benchmarks/bench_watched.py [lockstep sitl training]`; without words, all of them. It
+needs a Chromium, which draws in software unless it has a GPU: what it takes is then taken from
+everything else on the machine, whose load stands beside each figure.
+
+lockstep  The same flight at full speed, alone, with a view that nobody looks at, and with a page:
+          fingerprints, and wall time.
+sitl      Flights in real time on twenty seeds, each alone and with a page, in turn: t2, how late
+          the vehicle's ticks were, and the simulated time that was given up, paired by seed. The
+          page draws at the lowest priority, as a browser of another machine would take nothing;
+          with `--same-machine` it takes what it wants.
+training  The same short training, alone and watched: weights, wall time and processor time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import hashlib
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+import zipfile
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))
+
+from airl_mav.flight.paired import median_ratio  # noqa: E402 (from here on the checkout is found)
+from airl_mav.flight.statistics import Estimate  # noqa: E402
+from airl_mav.profiles.loading import load_profile  # noqa: E402
+from airl_mav.scenario.model import Scenario  # noqa: E402
+from airl_mav.scenario.resolve import resolve  # noqa: E402
+from airl_mav.view.ends import ViewEnds  # noqa: E402
+from airl_mav.view.handshake import Request  # noqa: E402
+from airl_mav.view.viewer import Viewer  # noqa: E402
+from tests.support.browser import Page, browser  # noqa: E402
+from tests.support.processes import SITL_WITHOUT_REPORT  # noqa: E402
+
+LOWEST = 19
+"""Niceness of a browser that takes no more than what is left over."""
+
+
+def say(*words: object) -> None:
+    print(*words, flush=True)
+
+
+def load() -> str:
+    one, five, _ = os.getloadavg()
+    return f"load {one:.1f} (1 min), {five:.1f} (5 min) on {os.cpu_count()} cores"
+
+
+@contextmanager
+def viewed(*, paced: bool) -> Iterator[Viewer]:
+    request = Request(
+        run="bench",
+        port=None,
+        paced=paced,
+        speed=None,
+        steerable=paced,
+        compensable=False,
+        compensated=False,
+    )
+    with closing(Viewer(request)) as viewer:
+        yield viewer
+
+
+def wait_until_shown(page: Page, seconds: float = 60.0) -> None:
+    end = time.monotonic() + seconds
+    while "phase" not in page.text():
+        assert time.monotonic() < end, "the page shows no flight"
+        time.sleep(0.02)
+
+
+def measure_lockstep(folder: Path, pairs: int = 4) -> None:
+    from airl_mav.lockstep.flight import fly
+
+    resolved = resolve(
+        Scenario(policy="static-obstacles", level="lockstep", time_limit_s=60.0, speed=None)
+    )
+
+    def lockstep(ends: ViewEnds | None) -> tuple[float, str]:
+        gc.collect()
+        began = time.monotonic()
+        record = fly(resolved, resolved.fresh_policy(11), 0, 11, view=ends).record
+        return time.monotonic() - began, str(record.sha256)
+
+    lockstep(None)
+    with viewed(paced=True) as viewer, ExitStack() as held:
+        unseen = [(lockstep(None), lockstep(viewer.ends)) for _ in range(pairs)]
+        page = held.enter_context(browser(folder))
+        page.resize(900, 600)
+        page.open(viewer.url)
+        wait_until_shown(page)
+        seen = [(lockstep(None), lockstep(viewer.ends)) for _ in range(pairs)]
+    digests = {sha for pair in (*unseen, *seen) for _, sha in pair}
+    for name, rows in (("with --view, nobody there", unseen), ("with a page", seen)):
+        ratio = statistics.median(watched[0] / alone[0] for alone, watched in rows)
+        say(f"lockstep at full speed, {name}: {ratio:.2f} times the wall time of alone"
+            f" ({rows[0][0][0]:.2f} s); {load()}")  # fmt: skip
+    say(f"fingerprints of all {4 * pairs} flights: {'the same' if len(digests) == 1 else digests}")
+
+
+@dataclass(frozen=True)
+class Disturbed:
+    """How well a host has kept up with a flight in real time [ms]."""
+
+    t2: float
+    """Median."""
+    lateness: float
+    """99 % of the vehicle's ticks began less late."""
+    slipped: float
+    """Simulated time that was given up."""
+
+
+def measure_sitl(folder: Path, pairs: int = 20, niceness: int = LOWEST) -> None:
+    rows: dict[bool, list[Disturbed]] = {False: [], True: []}
+    for seed in range(11, 11 + pairs):
+        for watched in (False, True):
+            out = folder / f"{seed}-{watched}"
+            rows[watched].append(disturbed(out, seed, niceness if watched else None))
+        alone, seen = rows[False][-1], rows[True][-1]
+        say(f"seed {seed}: alone {alone}, watched {seen}")
+    for watched, found in rows.items():
+        t2 = statistics.median(each.t2 for each in found)
+        lateness = statistics.median(each.lateness for each in found)
+        slipped = sum(each.slipped for each in found)
+        say(
+            f"sitl, {'watched' if watched else 'alone'}, median of {pairs} flights: t2 {t2:.2f} ms,"
+            f" 99 % of ticks less than {lateness:.2f} ms late; {slipped:.1f} ms given up in all"
+        )
+    for name, figure in (("t2, median", "t2"), ("lateness of ticks, p99", "lateness")):
+        alone_ms, seen_ms = ([getattr(each, figure) for each in rows[k]] for k in (False, True))
+        more = median_ratio(alone_ms, seen_ms)
+        say(f"sitl, watched against alone, {name}: {told(more)}; {load()}")
+
+
+def told(more: Estimate) -> str:
+    return f"{more.value:+.1f} [{more.low:+.1f}, {more.high:+.1f}] %, n = {more.n}"
+
+
+def disturbed(out: Path, seed: int, niceness: int | None) -> Disturbed:
+    """Fly a seed at level sitl, watched by a browser of some niceness or by none."""
+    from airl_mav.rehearsal.run_folder import TICK_LATENESS
+    from airl_mav.rehearsal.run_folder import load as load_run
+
+    words = [sys.executable, *SITL_WITHOUT_REPORT, "--episodes", "1", "--seed", str(seed)]
+    words += ["--out", str(out), "--policy", "static-obstacles"]
+    with ExitStack() as held:
+        process = subprocess.Popen(  # noqa: S603 (this checkout)
+            words + ([] if niceness is None else ["--view"]),
+            cwd=ROOT,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        assert process.stdout is not None
+        if niceness is not None:
+            line = next(each for each in process.stdout if "view" in each)
+            profile = out.with_suffix(".browser")
+            profile.mkdir()
+            page = held.enter_context(browser(profile, niceness=niceness))
+            page.resize(900, 600)
+            page.open(line.split()[-1])
+        rest = process.stdout.read()
+        assert process.wait() == 0, rest
+    run = load_run(out)
+    (record,) = run.episodes
+    stamps = run.latency[record.index]
+    t2_us = stamps["action_ready_us"] - stamps["infer_start_us"]
+    return Disturbed(
+        float(np.median(t2_us)) / 1e3,
+        float(np.percentile(stamps[TICK_LATENESS], 99.0)) / 1e3,
+        record.slipped_us / 1e3,
+    )
+
+
+TRAINING = """
+description = "a short one"
+steps = 6_000
+vehicles = 32
+[environment]
+arena = "dynamic-obstacles"
+[algorithm]
+learning_starts = 500
+[selection]
+every = 100_000
+episodes = 1
+"""
+
+
+def measure_training(folder: Path, pairs: int = 3) -> None:
+    (folder / "bench.toml").write_text(TRAINING, encoding="utf-8")
+    ratios, weights = [], set()
+    with viewed(paced=False) as viewer:
+        for k in range(pairs + 1):
+            took = {}
+            for ends in (None, viewer.ends):
+                out = folder / f"train-{k}-{ends is not None}"
+                # A process each: what one has compiled, allocated and cached is not the other's.
+                words = [sys.executable, __file__, "--train", str(folder / "bench.toml"), str(out)]
+                words += [] if ends is None else [ends.model_dump_json()]
+                done = subprocess.run(words, check=True, stdout=subprocess.PIPE, text=True)  # noqa: S603
+                wall, cpu = map(float, done.stdout.split()[-2:])
+                took[ends is not None] = wall, cpu
+                with zipfile.ZipFile(out / "best" / "model.zip") as saved:
+                    weights.add(hashlib.sha256(saved.read("policy.pth")).hexdigest())
+            if k:  # the first pair compiles
+                ratios.append((took[True][0] / took[False][0], took[True][1] / took[False][1]))
+    wall, cpu = np.median(np.array(ratios), axis=0)
+    say(
+        f"training, watched: {wall:.3f} times the wall time, {cpu:.3f} times the processor time;"
+        f" weights {'the same' if len(weights) == 1 else 'DIFFER'}; {load()}"
+    )
+
+
+def train(config: str, out: str, ends: str | None) -> None:
+    """Train once, and print wall and processor time."""
+    from airl_mav.training.config import TrainingConfig
+    from airl_mav.training.run import train as learn
+
+    view = None if ends is None else ViewEnds.model_validate_json(ends)
+    wall, cpu = time.monotonic(), time.process_time()
+    learn(load_profile("training", config, TrainingConfig), Path(out), name="bench", view=view)
+    print(time.monotonic() - wall, time.process_time() - cpu)
+
+
+MEASURES: dict[str, Callable[[Path], None]] = {
+    "lockstep": measure_lockstep,
+    "sitl": measure_sitl,
+    "training": measure_training,
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("what", nargs="*", choices=[*MEASURES, []], help="by default all")
+    parser.add_argument(
+        "--same-machine", action="store_true", help="level sitl: the browser takes what it wants"
+    )
+    parser.add_argument("--train", nargs="+", help=argparse.SUPPRESS)
+    asked = parser.parse_args()
+    if asked.train:
+        train(*asked.train, *[None] * (3 - len(asked.train)))
+        return
+    say(load())
+    if asked.same_machine:
+        MEASURES["sitl"] = partial(measure_sitl, niceness=0)
+    for name in asked.what or MEASURES:
+        say(f"--- {name}")
+        with tempfile.TemporaryDirectory() as folder:
+            MEASURES[name](Path(folder))
+
+
+if __name__ == "__main__":
+    main()

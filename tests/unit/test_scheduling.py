@@ -1,0 +1,60 @@
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import psutil
+import pytest
+
+AUTOGROUP = Path("/proc/self/autogroup")
+
+GIVING_WAY = """
+import os
+from airl_mav.core.scheduling import give_way
+give_way(7)
+print(os.getpriority(os.PRIO_PROCESS, 0), os.getsid(0) == os.getpid())
+try:
+    print(open("/proc/self/autogroup").read())
+except OSError:
+    pass
+"""
+
+
+@pytest.mark.parametrize("leads", [False, True], ids=["of its session", "leads a session"])
+def test_a_process_gives_way_as_a_session_too(leads: bool) -> None:
+    before = AUTOGROUP.read_text() if AUTOGROUP.exists() else ""
+    done = subprocess.run(
+        [sys.executable, "-c", GIVING_WAY],
+        check=True,
+        capture_output=True,
+        text=True,
+        start_new_session=leads,
+    )
+    niceness, session, *group = done.stdout.split()
+    assert int(niceness) == min(19, os.getpriority(os.PRIO_PROCESS, 0) + 7)
+    assert session == "True"
+    if before:
+        # "/autogroup-1412 nice 7"; that of whoever has started it stays as it is.
+        assert group[1:] == ["nice", "7"] and group[0] != before.split()[0]
+        assert AUTOGROUP.read_text() == before
+
+
+def test_a_view_gives_way() -> None:
+    from airl_mav.view.handshake import Request
+    from airl_mav.view.viewer import Viewer
+
+    request = Request(run="t", port=None, paced=False, speed=None, steerable=False,
+                      compensable=False, compensated=False)  # fmt: skip
+    viewer = Viewer(request)
+    try:
+        (view,) = (
+            child
+            for child in psutil.Process().children()
+            if "airl_mav.view.server" in child.cmdline()
+        )
+        assert os.getsid(view.pid) == view.pid
+        assert view.nice() > psutil.Process().nice()
+    finally:
+        viewer.close()
