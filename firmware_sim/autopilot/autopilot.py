@@ -54,7 +54,7 @@ from firmware_sim.autopilot.requests import (
     Place,
     Request,
 )
-from firmware_sim.autopilot.snapshot import Parts, snapshot
+from firmware_sim.autopilot.snapshot import Parts, Snapshot
 from firmware_sim.interfaces import ActuatorControls, Odometry, SensorSample, Truth
 
 _STILL: Motors = (0.0, 0.0, 0.0, 0.0)
@@ -114,6 +114,7 @@ class BuiltinAutopilot:
             self._newest,
             self._home,
             self.plans,
+            value,
         )
         self._snapshot: AutopilotState | None = None
         self.failures: Failures | None = None
@@ -433,6 +434,5 @@ class BuiltinAutopilot:
         sample = self.sample
         if sample is None:
             raise RuntimeError("no tick yet: the autopilot has no state")
-        hover = self.parameters["MPC_THR_HOVER"]
-        self._snapshot = snapshot(self._parts, sample, self._demand, self._motors, hover)
+        self._snapshot = Snapshot(self._parts, sample, self._demand, self._motors)
         return self._snapshot

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -216,9 +216,6 @@ class FenceStatus(NamedTuple):
         return self.distance, self.altitude, self.custom
 
 
-NO_BREACH = FenceStatus()
-
-
 class OrbitStatus(NamedTuple):
     """The circle that Orbit mode flies."""
 
@@ -249,61 +246,163 @@ class Health(NamedTuple):
     """No check keeps the vehicle from arming in its mode."""
 
 
-ALL_HEALTHY = Health()
+class AutopilotState(Protocol):
+    """The autopilot after its newest tick, for whoever speaks for it; valid until the next one.
 
-
-class AutopilotState(NamedTuple):
-    """One consistent snapshot after a tick."""
-
-    time_us: int
-    estimate: Estimate
-    status: CommanderStatus
-    setpoint: Setpoint
-    """What the controller tracks (in every mode)."""
-    attitude_setpoint: Vector  # (4,) body -> NED
-    rate_setpoint: Vector  # (3,) FRD [rad/s]
-    thrust_setpoint: float
-    """Collective, 0..1."""
-    motors: tuple[float, float, float, float]
-    accel: Vector  # (3,) newest raw sample, FRD [m/s²]
-    gyro: Vector  # (3,) newest raw sample, FRD [rad/s]
-    mag: Vector  # (3,) newest raw sample, FRD [gauss]
-    pressure_hpa: float
-    temperature_c: float
-    battery: BatterySample
-    gps: GpsFix | None
-    """Newest fix; None before the first."""
-    home: Geodetic | None
-    """Set when the estimator's origin is set and at arming; None before."""
-    origin: Geodetic | None
-    """The point of the globe where local NED is zero; None before the first fix."""
-    load: float = 0.0
-    """Share of the tick spent computing, 0..1."""
-    armed_us: int = 0
-    """When it was armed [µs], 0 while it is not."""
-    takeoff_us: int = 0
-    """When it left the ground [µs], 0 before."""
-    mission: MissionProgress = NO_MISSION
-    fence: FenceStatus = NO_BREACH
-    orbit: OrbitStatus | None = None
-    """In Orbit mode."""
-    health: Health = ALL_HEALTHY
-    hover_thrust: float = 0.5
-    """Collective that hovers, 0..1."""
-    destination: tuple[float, float, float] | None = None
-    """Where an automatic mode is going, local NED [m]; None in other modes."""
-    home_yaw: float = 0.0
-    """Heading at home [rad]."""
-    sticks: Sticks | None = None
-    """A pilot's; None = none are heard."""
-    esc_outputs: tuple[float, float, float, float] | None = None
-    """What the speed controllers report that their motors do; None: what they are told."""
-    odometry: Odometry | None = None
-    """The newest pose that something else has estimated; None before any."""
-    odometry_us: int = 0
-    """When it was told [µs]."""
+    What nobody asks for need not be worked out: most ticks' streams want a few of these.
+    """
 
     @property
-    def has_pilot(self) -> bool:
-        """Whether a pilot's sticks are heard."""
-        return self.sticks is not None
+    def time_us(self) -> int:
+        """Simulated time of the tick [µs]."""
+        ...
+
+    @property
+    def estimate(self) -> Estimate:
+        """The estimator's output."""
+        ...
+
+    @property
+    def status(self) -> CommanderStatus:
+        """What the commander reports."""
+        ...
+
+    @property
+    def setpoint(self) -> Setpoint:
+        """What the controller tracks (in every mode)."""
+        ...
+
+    @property
+    def attitude_setpoint(self) -> Vector:
+        """(4,) body -> NED."""
+        ...
+
+    @property
+    def rate_setpoint(self) -> Vector:
+        """(3,) FRD [rad/s]."""
+        ...
+
+    @property
+    def thrust_setpoint(self) -> float:
+        """Collective, 0..1."""
+        ...
+
+    @property
+    def motors(self) -> tuple[float, float, float, float]:
+        """Commands of the motors, 0..1."""
+        ...
+
+    @property
+    def accel(self) -> Vector:
+        """(3,) newest raw sample, FRD [m/s²]."""
+        ...
+
+    @property
+    def gyro(self) -> Vector:
+        """(3,) newest raw sample, FRD [rad/s]."""
+        ...
+
+    @property
+    def mag(self) -> Vector:
+        """(3,) newest raw sample, FRD [gauss]."""
+        ...
+
+    @property
+    def pressure_hpa(self) -> float:
+        """Newest static pressure [hPa]."""
+        ...
+
+    @property
+    def temperature_c(self) -> float:
+        """Of the air [°C]."""
+        ...
+
+    @property
+    def battery(self) -> BatterySample:
+        """What the power module reports."""
+        ...
+
+    @property
+    def gps(self) -> GpsFix | None:
+        """Newest fix; None before the first."""
+        ...
+
+    @property
+    def home(self) -> Geodetic | None:
+        """Set when the estimator's origin is set and at arming; None before."""
+        ...
+
+    @property
+    def origin(self) -> Geodetic | None:
+        """The point of the globe where local NED is zero; None before the first fix."""
+        ...
+
+    @property
+    def load(self) -> float:
+        """Share of the tick spent computing, 0..1."""
+        ...
+
+    @property
+    def armed_us(self) -> int:
+        """When it was armed [µs], 0 while it is not."""
+        ...
+
+    @property
+    def takeoff_us(self) -> int:
+        """When it left the ground [µs], 0 before."""
+        ...
+
+    @property
+    def mission(self) -> MissionProgress:
+        """How far the mission has come."""
+        ...
+
+    @property
+    def fence(self) -> FenceStatus:
+        """Which limits of the geofence are violated."""
+        ...
+
+    @property
+    def orbit(self) -> OrbitStatus | None:
+        """The circle that is flown, in Orbit mode."""
+        ...
+
+    @property
+    def health(self) -> Health:
+        """What can be believed and used."""
+        ...
+
+    @property
+    def hover_thrust(self) -> float:
+        """Collective that hovers, 0..1."""
+        ...
+
+    @property
+    def destination(self) -> tuple[float, float, float] | None:
+        """Where an automatic mode is going, local NED [m]; None in other modes."""
+        ...
+
+    @property
+    def home_yaw(self) -> float:
+        """Heading at home [rad]."""
+        ...
+
+    @property
+    def sticks(self) -> Sticks | None:
+        """A pilot's; None = none are heard."""
+        ...
+
+    @property
+    def esc_outputs(self) -> tuple[float, float, float, float] | None:
+        """What the speed controllers report that their motors do; None: what they are told."""
+        ...
+
+    @property
+    def odometry(self) -> Odometry | None:
+        """The newest pose that something else has estimated; None before any."""
+        ...
+
+    @property
+    def odometry_us(self) -> int:
+        """When it was told [µs]."""
+        ...

@@ -1,26 +1,41 @@
-"""The snapshot that MAVLink, the recorder and tests get of the built-in autopilot."""
+"""What clients, the recorder and tests get of the built-in autopilot."""
+
+# ruff: noqa: D102 (what the properties are says `AutopilotState`)
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
-from airl_mav.control.controller import Controller
+from airl_mav.control.controller import Controller, ControlSetpoints
 from airl_mav.control.demand import AnyDemand, AttitudeDemand, RateDemand
 from airl_mav.control.mixer import Motors
-from firmware_sim.autopilot.autopilot_state import AutopilotState, Mode, Setpoint
+from airl_mav.core.frames import Geodetic
+from firmware_sim.autopilot.autopilot_state import (
+    CommanderStatus,
+    Estimate,
+    FenceStatus,
+    Health,
+    MissionProgress,
+    Mode,
+    OrbitStatus,
+    Setpoint,
+    Vector,
+)
 from firmware_sim.autopilot.estimator import Estimator
 from firmware_sim.autopilot.failsafes.supervisor import Supervisor
 from firmware_sim.autopilot.flight_commander import FlightCommander
 from firmware_sim.autopilot.guidance import Guidance
 from firmware_sim.autopilot.home import Home
+from firmware_sim.autopilot.manual_control import Sticks
 from firmware_sim.autopilot.navigation.navigator import Navigator
 from firmware_sim.autopilot.navigation.plan import Plans
 from firmware_sim.autopilot.navigation.progress import progress
 from firmware_sim.autopilot.newest_sensors import NewestSensors
-from firmware_sim.interfaces import SensorSample
+from firmware_sim.interfaces import BatterySample, GpsFix, Odometry, SensorSample
 
 
 class Parts(NamedTuple):
@@ -35,57 +50,154 @@ class Parts(NamedTuple):
     newest: NewestSensors
     home: Home
     plans: Plans
+    value: Callable[[str], float]
+    """Looks up a parameter by its name."""
 
 
-def snapshot(
-    parts: Parts, sample: SensorSample, demand: AnyDemand | None, motors: Motors, hover: float
-) -> AutopilotState:
-    """Take it after a tick.
+class Snapshot:
+    """Implements `AutopilotState` by asking the parts, each when somebody asks for it."""
 
-    Args:
-        parts: Of the autopilot.
-        sample: The tick's sensors.
-        demand: What is flown; None = the motors are stopped.
-        motors: Their commands, 0..1.
-        hover: Collective that hovers (MPC_THR_HOVER), 0..1.
-    """
-    estimate = parts.estimator.estimate()
-    attitude, rates, velocity, thrust = parts.controller.setpoints()
-    if demand is None or isinstance(demand, AttitudeDemand | RateDemand):
-        setpoint = Setpoint(estimate.position, velocity, math.nan, 0.0)
-    else:
-        position = np.array(demand.position)
-        setpoint = Setpoint(position, velocity, demand.yaw, demand.yaw_rate)
-    flight, context, newest = parts.commander.flight, parts.guidance.context, parts.newest
-    return AutopilotState(
-        time_us=sample.time_us,
-        estimate=estimate,
-        status=parts.commander.status,
-        setpoint=setpoint,
-        attitude_setpoint=attitude,
-        rate_setpoint=rates,
-        thrust_setpoint=thrust,
-        motors=motors,
-        accel=sample.accel,
-        gyro=sample.gyro,
-        mag=newest.mag,
-        pressure_hpa=newest.pressure_hpa,
-        temperature_c=sample.temperature_c,
-        battery=sample.battery,
-        gps=newest.gps,
-        home=parts.home.place,
-        origin=parts.estimator.origin,
-        orbit=context.orbit if flight.mode is Mode.ORBIT else None,
-        armed_us=parts.commander.armed_us,
-        takeoff_us=parts.commander.takeoff_us,
-        mission=progress(parts.plans),
-        fence=parts.navigator.fence.status,
-        hover_thrust=hover,
-        destination=None if demand is None else parts.guidance.destination,
-        home_yaw=context.home_yaw,
-        health=parts.supervisor.health(sample.time_us),
-        sticks=context.sticks,
-        esc_outputs=sample.esc_outputs,
-        odometry=parts.estimator.odometry,
-        odometry_us=parts.estimator.odometry_us,
-    )
+    load = 0.0
+
+    __slots__ = ("_controlled", "_demand", "_health", "_parts", "_sample", "motors", "status")
+
+    def __init__(
+        self, parts: Parts, sample: SensorSample, demand: AnyDemand | None, motors: Motors
+    ) -> None:
+        """Take it after a tick.
+
+        Args:
+            parts: Of the autopilot.
+            sample: The tick's sensors.
+            demand: What is flown; None = the motors are stopped.
+            motors: Their commands, 0..1.
+        """
+        self._parts, self._sample, self._demand = parts, sample, demand
+        self.motors = motors
+        self.status: CommanderStatus = parts.commander.status
+        self._controlled: ControlSetpoints | None = None
+        self._health: Health | None = None
+
+    @property
+    def time_us(self) -> int:
+        return self._sample.time_us
+
+    @property
+    def estimate(self) -> Estimate:
+        return self._parts.estimator.estimate()
+
+    @property
+    def setpoint(self) -> Setpoint:
+        demand, velocity = self._demand, self._setpoints.velocity
+        if demand is None or isinstance(demand, AttitudeDemand | RateDemand):
+            return Setpoint(self.estimate.position, velocity, math.nan, 0.0)
+        return Setpoint(np.array(demand.position), velocity, demand.yaw, demand.yaw_rate)
+
+    @property
+    def attitude_setpoint(self) -> Vector:
+        return self._setpoints.attitude
+
+    @property
+    def rate_setpoint(self) -> Vector:
+        return self._setpoints.rates
+
+    @property
+    def thrust_setpoint(self) -> float:
+        return self._setpoints.thrust
+
+    @property
+    def accel(self) -> Vector:
+        return self._sample.accel
+
+    @property
+    def gyro(self) -> Vector:
+        return self._sample.gyro
+
+    @property
+    def mag(self) -> Vector:
+        return self._parts.newest.mag
+
+    @property
+    def pressure_hpa(self) -> float:
+        return self._parts.newest.pressure_hpa
+
+    @property
+    def temperature_c(self) -> float:
+        return self._sample.temperature_c
+
+    @property
+    def battery(self) -> BatterySample:
+        return self._sample.battery
+
+    @property
+    def gps(self) -> GpsFix | None:
+        return self._parts.newest.gps
+
+    @property
+    def home(self) -> Geodetic | None:
+        return self._parts.home.place
+
+    @property
+    def origin(self) -> Geodetic | None:
+        return self._parts.estimator.origin
+
+    @property
+    def armed_us(self) -> int:
+        return self._parts.commander.armed_us
+
+    @property
+    def takeoff_us(self) -> int:
+        return self._parts.commander.takeoff_us
+
+    @property
+    def mission(self) -> MissionProgress:
+        return progress(self._parts.plans)
+
+    @property
+    def fence(self) -> FenceStatus:
+        return self._parts.navigator.fence.status
+
+    @property
+    def orbit(self) -> OrbitStatus | None:
+        flies = self._parts.commander.flight.mode is Mode.ORBIT
+        return self._parts.guidance.context.orbit if flies else None
+
+    @property
+    def health(self) -> Health:
+        if self._health is None:
+            self._health = self._parts.supervisor.health(self._sample.time_us)
+        return self._health
+
+    @property
+    def hover_thrust(self) -> float:
+        return self._parts.value("MPC_THR_HOVER")
+
+    @property
+    def destination(self) -> tuple[float, float, float] | None:
+        return None if self._demand is None else self._parts.guidance.destination
+
+    @property
+    def home_yaw(self) -> float:
+        return self._parts.guidance.context.home_yaw
+
+    @property
+    def sticks(self) -> Sticks | None:
+        return self._parts.guidance.context.sticks
+
+    @property
+    def esc_outputs(self) -> tuple[float, float, float, float] | None:
+        return self._sample.esc_outputs
+
+    @property
+    def odometry(self) -> Odometry | None:
+        return self._parts.estimator.odometry
+
+    @property
+    def odometry_us(self) -> int:
+        return self._parts.estimator.odometry_us
+
+    @property
+    def _setpoints(self) -> ControlSetpoints:
+        if self._controlled is None:
+            self._controlled = self._parts.controller.setpoints()
+        return self._controlled

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,12 +18,15 @@ from airl_mav.core.frames import Geodetic, local_to_geodetic, quat_from_euler, w
 from airl_mav.profiles.parameters import SPECS
 from firmware_sim.autopilot.autopilot_state import (
     Arming,
-    AutopilotState,
     CommanderStatus,
     Estimate,
+    FenceStatus,
+    Health,
     Landed,
     Message,
+    MissionProgress,
     Mode,
+    OrbitStatus,
     Result,
     Setpoint,
     Severity,
@@ -53,6 +57,42 @@ DEFAULT_PARAMETERS: dict[str, int | float] = {
     "TEST_NEGATIVE": -1,
     "TEST_SIGNALLING": -5_000_000,  # as a float: a signalling NaN
 }
+
+
+class KnownState(NamedTuple):
+    """Implements `AutopilotState` by plain values."""
+
+    time_us: int
+    estimate: Estimate
+    status: CommanderStatus
+    setpoint: Setpoint
+    attitude_setpoint: Vector
+    rate_setpoint: Vector
+    thrust_setpoint: float
+    motors: tuple[float, float, float, float]
+    accel: Vector
+    gyro: Vector
+    mag: Vector
+    pressure_hpa: float
+    temperature_c: float
+    battery: BatterySample
+    gps: GpsFix | None
+    home: Geodetic | None
+    origin: Geodetic | None
+    load: float = 0.0
+    armed_us: int = 0
+    takeoff_us: int = 0
+    mission: MissionProgress = MissionProgress()
+    fence: FenceStatus = FenceStatus()
+    orbit: OrbitStatus | None = None
+    health: Health = Health()
+    hover_thrust: float = 0.5
+    destination: tuple[float, float, float] | None = None
+    home_yaw: float = 0.0
+    sticks: Sticks | None = None
+    esc_outputs: tuple[float, float, float, float] | None = None
+    odometry: Odometry | None = None
+    odometry_us: int = 0
 
 
 class Parameters:
@@ -262,7 +302,7 @@ class KinematicAutopilot:
     def gcs_heartbeat(self, time_us: int) -> None:
         self.gcs_heartbeats.append(time_us)
 
-    def state(self) -> AutopilotState:
+    def state(self) -> KnownState:
         zero = np.zeros(3)
         estimate = Estimate(
             time_us=self.time_us,
@@ -281,7 +321,7 @@ class KinematicAutopilot:
         if self.origin is not None:
             here = local_to_geodetic(self.position, self.origin)
             fix = GpsFix(here, self.velocity, eph_m=0.9, epv_m=1.8, satellites=10)
-        return AutopilotState(
+        return KnownState(
             time_us=self.time_us,
             estimate=estimate,
             status=CommanderStatus(

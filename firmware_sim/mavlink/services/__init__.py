@@ -104,5 +104,8 @@ PENDING: tuple[Callable[[Context], None], ...] = (
 
 def send_pending(context: Context) -> None:
     """Send a client what is next of all that it is getting piece by piece."""
+    if not context.is_getting:  # Most of the time: of the missions there may still be news.
+        missions.send_pending(context)
+        return
     for send in PENDING:
         send(context)

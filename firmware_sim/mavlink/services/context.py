@@ -67,6 +67,21 @@ class Context:
     refusals: set[str] = field(default_factory=set)
     """Why setpoints have been refused since the last one that was accepted."""
 
+    @property
+    def is_getting(self) -> bool:
+        """Whether a service other than the missions' sends the client something piece by piece."""
+        ftp = self.ftp
+        return (
+            self.next_parameter is not None
+            or ftp.burst is not None
+            or ftp.summing is not None
+            or self.calibration.active
+            or bool(self.shell.output)
+            or self.log_listing is not None
+            or self.log_download is not None
+            or self.log_stream is not None
+        )
+
     def close(self) -> None:
         """Release what is held for the client: it has gone, or another autopilot comes."""
         self.ftp.close()

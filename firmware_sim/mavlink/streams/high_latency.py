@@ -89,7 +89,7 @@ def _failures(state: AutopilotState) -> int:
         dialect.HL_FAILURE_FLAG_3D_GYRO: not health.gyro,
         dialect.HL_FAILURE_FLAG_3D_MAG: not health.mag,
         dialect.HL_FAILURE_FLAG_BATTERY: not health.battery,
-        dialect.HL_FAILURE_FLAG_RC_RECEIVER: not state.has_pilot,
+        dialect.HL_FAILURE_FLAG_RC_RECEIVER: state.sticks is None,
         dialect.HL_FAILURE_FLAG_OFFBOARD_LINK: offboard_lost,
         dialect.HL_FAILURE_FLAG_GEOFENCE: any(state.fence.breached),
         dialect.HL_FAILURE_FLAG_ESTIMATOR: not (health.attitude and health.position),

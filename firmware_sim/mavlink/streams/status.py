@@ -127,7 +127,7 @@ def sys_status(state: AutopilotState) -> Values:
     present: int = _PRESENT
     if state.status.arming is Arming.ARMED:
         present |= _LOGGED
-    if state.has_pilot:
+    if state.sticks is not None:
         present |= _RADIO
     healthy: int = _NEVER_WRONG
     unhealthy: int = 0
@@ -168,7 +168,7 @@ def _health(state: AutopilotState) -> Iterator[tuple[bool, int]]:
     located = health.position and _knows(state)
     yield located, dialect.MAV_SYS_STATUS_SENSOR_XY_POSITION_CONTROL
     yield health.battery, dialect.MAV_SYS_STATUS_SENSOR_BATTERY
-    yield state.has_pilot, _RADIO
+    yield state.sticks is not None, _RADIO
 
 
 def estimator_status(state: AutopilotState) -> Values:
