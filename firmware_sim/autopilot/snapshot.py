@@ -56,6 +56,7 @@ def snapshot(
     else:
         position = np.array(demand.position)
         setpoint = Setpoint(position, velocity, demand.yaw, demand.yaw_rate)
+    finder = parts.estimator.range
     flight, context, newest = parts.commander.flight, parts.guidance.context, parts.newest
     return AutopilotState(
         time_us=sample.time_us,
@@ -88,4 +89,7 @@ def snapshot(
         esc_outputs=sample.esc_outputs,
         odometry=parts.estimator.odometry,
         odometry_us=parts.estimator.odometry_us,
+        distance=None if finder is None else finder.reading,
+        distance_us=0 if finder is None else finder.reading_us,
+        clearance=None if finder is None else finder.clearance(),
     )
