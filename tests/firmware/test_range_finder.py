@@ -15,6 +15,7 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError
 from airl_mav.core.location import HOME
 from airl_mav.experiments.fault_flight import fly_fault
+from airl_mav.faults.catalogue import FITTED_CASES, STANDS, Case
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
@@ -418,13 +419,37 @@ def test_a_client_s_rangefinder_tells_the_ground_and_another_direction_does_not(
 # --- failures
 
 
-@pytest.mark.parametrize("kind", ["off", "stuck", "noise 5x", "bias 0.5m"])
-def test_a_rangefinder_that_fails_brings_no_vehicle_down_hard(kind: str) -> None:
-    found = fly_fault(load_vehicle("quad-indoor"), f"rangefinder {kind}", "offboard", 1)
-    assert found.end == "landed" and found.touchdown_m_s is not None
-    assert found.touchdown_m_s < TOUCHDOWN_M_S
+@pytest.mark.parametrize("case", FITTED_CASES, ids=lambda case: case.fault)
+def test_how_a_flight_ends_with_a_rangefinder_that_fails(case: Case) -> None:
+    found = fly_fault(load_vehicle("quad-indoor"), case.fault, "offboard", 1)
+    assert found.end in case.ends
+    # Stuck at 5 m no ground is near: a real PX4 1.16 does not know that it stands, either.
+    # (scripts/rangefinder_compared.py --faults "rangefinder stuck at 25s")
+    assert (found.end == "flying") is (case.ends == STANDS)
+    if found.touchdown_m_s is not None:
+        assert found.touchdown_m_s < TOUCHDOWN_M_S
 
 
 def test_a_rangefinder_that_a_vehicle_lacks_cannot_fail() -> None:
     with pytest.raises(FieldError, match=r"with a vehicle that has rangefinder"):
         resolve(Scenario(vehicle="quad-vio", faults=("rangefinder off",), level="lockstep"))
+
+
+def test_arming_waits_for_a_sensor_that_is_asked_for() -> None:
+    rig = Rig(3, parameters={"SYS_HAS_NUM_DIST": 1.0})
+    bit = dialect.MAV_SYS_STATUS_SENSOR_LASER_POSITION
+    rig.boot()
+    rig.run(1.0)
+    assert rig.ap.arm(force=False) is Result.TEMPORARILY_REJECTED
+    assert not math.isnan(rig.said("Preflight Fail: Distance Sensor 0 missing"))
+    assert not status.sys_status(rig.ap.state())[0] & bit
+    reading = DistanceReading(0.3, 0.1, 12.0, quality=100)
+    rig.run(0.5, lambda: rig.ap.measure_distance(reading))
+    assert all(field & bit for field in status.sys_status(rig.ap.state())[:3])
+    rig.run(1.5)
+    present, enabled, healthy, *_ = status.sys_status(rig.ap.state())
+    assert present & bit and enabled & bit and not healthy & bit
+    assert rig.ap.arm(force=False) is Result.TEMPORARILY_REJECTED
+    assert not math.isnan(rig.said("Preflight Fail: no valid data from distance sensor 0"))
+    rig.run(0.5, lambda: rig.ap.measure_distance(reading))
+    assert rig.ap.arm(force=False) is Result.ACCEPTED
