@@ -22,6 +22,9 @@ PoseFrame = Literal["ned", "frd"]
 """What a pose is measured in: north, east, down; or forward, right, down as it was at first, with a
 heading that nobody knows."""
 
+DOWNWARD = 25
+"""MAV_SENSOR_ROTATION_PITCH_270: a distance sensor that looks down."""
+
 VelocityFrame = Literal["ned", "frd", "body"]
 """What a velocity is measured in: as a pose, or in the vehicle's own axes FRD."""
 
@@ -61,6 +64,24 @@ class Odometry(NamedTuple):
     """Percent; 0 = not told."""
 
 
+class DistanceReading(NamedTuple):
+    """One range of a distance sensor; the fields are those of PX4's distance_sensor."""
+
+    distance_m: float
+    least_m: float
+    """What it measures at least [m]."""
+    greatest_m: float
+    """What it measures at most [m]."""
+    variance_m2: float = 0.0
+    """0 = not told."""
+    quality: int = -1
+    """Percent; 0 = invalid, -1 = not told."""
+    orientation: int = DOWNWARD
+    """MAV_SENSOR_ORIENTATION."""
+    kind: int = 0
+    """MAV_DISTANCE_SENSOR: 0 = laser."""
+
+
 class BatterySample(NamedTuple):
     """What a power module reports."""
 
@@ -88,6 +109,8 @@ class SensorSample(NamedTuple):
     None: what they are told."""
     odometry: Odometry | None = None
     """Of external vision that is part of the vehicle."""
+    distance: DistanceReading | None = None
+    """Of a rangefinder that is part of the vehicle."""
 
 
 class ActuatorControls(NamedTuple):

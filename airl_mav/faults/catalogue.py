@@ -75,4 +75,15 @@ CASES: tuple[Case, ...] = (
 """What PX4 is expected to survive, and what no quadrotor does. Of the flight controller alone: the
 camera, and the link beyond what it carries, are the companion's."""
 
-CASE_OF: Mapping[str, Case] = {case.fault: case for case in CASES}
+STANDS: frozenset[End] = frozenset({"landed", "flying"})
+"""It comes down safely, and may not be told that it stands: its motors go on."""
+
+FITTED_CASES: tuple[Case, ...] = (
+    Case("rangefinder off"),
+    Case("rangefinder stuck", STANDS, frozenset({"not armed"}) | STANDS),
+    Case("rangefinder noise 5x"),
+    Case("rangefinder bias 0.5m"),
+)
+"""Of sensors that not every vehicle has: in no matrix but one that asks for them."""
+
+CASE_OF: Mapping[str, Case] = {case.fault: case for case in (*CASES, *FITTED_CASES)}

@@ -20,6 +20,7 @@ Part = Literal[
     "baro",
     "gps",
     "vision",
+    "rangefinder",
     "motor1",
     "motor2",
     "motor3",
@@ -40,7 +41,7 @@ Part = Literal[
 Phase = Literal["ground", "climb", "hold", "offboard", "mission", "return", "landing"]
 """Phases of a flight that can set a fault off, by what the flight controller flies."""
 
-SENSORS: tuple[Part, ...] = ("accel", "gyro", "mag", "baro", "gps", "vision")
+SENSORS: tuple[Part, ...] = ("accel", "gyro", "mag", "baro", "gps", "vision", "rangefinder")
 MOTORS: tuple[Part, ...] = ("motor1", "motor2", "motor3", "motor4")
 LINKS: tuple[Part, ...] = ("link", "uplink", "downlink")
 PROCESSES: tuple[Part, ...] = ("companion", "firmware")
@@ -135,6 +136,14 @@ _SENSORS: Mapping[Part, _Sensor] = {
         off="it tells no poses any more",
         bias_meaning="is added to the position, in the frame of the start: a jump that is not told",
         more=_DRIFT,
+    ),
+    "rangefinder": _Sensor(
+        "m",
+        1_000.0,
+        _METRES,
+        width=1,
+        off="it tells no ranges any more",
+        bias_meaning="is added to the range",
     ),
 }
 

@@ -1,8 +1,9 @@
-"""The sensors of a vehicle profile, but its camera: inertial, magnetic, pressure, GPS, vision."""
+"""The sensors of a vehicle profile, but its camera: inertial, magnetic, pressure, GPS, and more."""
 
 from __future__ import annotations
 
-from pydantic import Field
+from pydantic import Field, model_validator
+from typing_extensions import Self
 
 from airl_mav.core.fields import ProfileModel, quantity
 
@@ -63,6 +64,29 @@ class Vision(ProfileModel):
     yaw_drift_rad_sqrt_s: float = quantity("heading drift random walk", "rad/sqrt(s)", ge=0, le=0.1)
 
 
+class Rangefinder(ProfileModel):
+    """A distance sensor that looks straight down in body axes: one ray.
+
+    It tells a range outside its limits, and none at all, as invalid (a quality of 0).
+    """
+
+    rate_hz: float = quantity("ranges a second", "Hz", ge=1, le=100)
+    least_m: float = quantity("least range that it measures", "m", ge=0, le=5)
+    greatest_m: float = quantity("greatest range that it measures", "m", gt=0.1, le=300)
+    noise_m: float = quantity("white noise, sd", "m", ge=0, le=1)
+    forward_m: float = quantity("its place ahead of the centre", "m", default=0.0, ge=-2, le=2)
+    right_m: float = quantity("its place to the right of the centre", "m", default=0.0, ge=-2, le=2)
+    down_m: float = quantity("its place below the centre", "m", default=0.0, ge=-2, le=2)
+
+    @model_validator(mode="after")
+    def _measures(self) -> Self:
+        if self.greatest_m <= self.least_m:
+            raise ValueError(
+                f"greatest_m = {self.greatest_m:g}: accepted: more than least_m = {self.least_m:g}"
+            )
+        return self
+
+
 class Sensors(ProfileModel):
     """The sensor suite."""
 
@@ -72,4 +96,7 @@ class Sensors(ProfileModel):
     gps: Gps
     vision: Vision | None = Field(
         default=None, description="what tells the flight controller its pose; absent = nothing does"
+    )
+    rangefinder: Rangefinder | None = Field(
+        default=None, description="what measures how far the ground is; absent = nothing does"
     )

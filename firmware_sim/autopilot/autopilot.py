@@ -55,9 +55,12 @@ from firmware_sim.autopilot.requests import (
     Request,
 )
 from firmware_sim.autopilot.snapshot import Parts, Snapshot
-from firmware_sim.interfaces import ActuatorControls, Odometry, SensorSample, Truth
+from firmware_sim.interfaces import ActuatorControls, DistanceReading, Odometry, SensorSample, Truth
 
 _STILL: Motors = (0.0, 0.0, 0.0, 0.0)
+
+CLIENTS_SENSOR = 1
+"""Source of ranges: not the vehicle's own sensor."""
 
 # Bound once: looking up a member of an enumeration at every tick is slow.
 _GROUND, _AIR = Phase.GROUND, Phase.AIR
@@ -136,6 +139,9 @@ class BuiltinAutopilot:
         self.estimator.step(sensors.trusted(sample) if sensors.distrusted else sample)
         self._snapshot = None
         self._newest.take(sample)
+        finder = self.estimator.range
+        if finder is not None:
+            self._guidance.context.ground = self._land_detector.ground = finder.clearance()
         if sample.esc_outputs is not None:
             supervisor.watch.hear_escs(time_us, self._motors, sample.esc_outputs)
         if self._home.place is None and self.estimator.origin is not None:
@@ -408,6 +414,11 @@ class BuiltinAutopilot:
     def see(self, odometry: Odometry) -> None:
         """Hand over a pose that something else has estimated."""
         self.estimator.see(odometry)
+        self._snapshot = None
+
+    def measure_distance(self, reading: DistanceReading) -> None:
+        """Hand over what a client's distance sensor measures."""
+        self.estimator.measure(reading, CLIENTS_SENSOR)
         self._snapshot = None
 
     def see_obstacles(self, obstacles: Obstacles) -> None:

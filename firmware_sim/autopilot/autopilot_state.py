@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from airl_mav.core.frames import Geodetic
 from firmware_sim.autopilot.events.definition import Definition, Event
 from firmware_sim.autopilot.manual_control import Sticks
-from firmware_sim.interfaces import BatterySample, GpsFix, Odometry
+from firmware_sim.interfaces import BatterySample, DistanceReading, GpsFix, Odometry
 
 Vector = NDArray[np.float64]
 
@@ -169,6 +169,22 @@ class Estimate(NamedTuple):
     """Converged: may be armed and flown on."""
 
 
+class Clearance(NamedTuple):
+    """How far the ground is below the vehicle, as estimated (vehicle_local_position)."""
+
+    dist_bottom_m: float
+    """Not negative."""
+    valid: bool
+    variance_m2: float
+    """Of where the ground is, as PX4 reports it."""
+    by_range: bool
+    """Whether ranges say where the ground is."""
+    resets: int
+    """How often the ground has been put elsewhere."""
+    ratio: float
+    """Mean test ratio of ranges, as a share of the gate; NaN = none are fused."""
+
+
 class CommanderStatus(NamedTuple):
     """What the commander reports."""
 
@@ -233,6 +249,8 @@ class Health(NamedTuple):
     mag: bool = True
     baro: bool = True
     gps: bool = True
+    distance: bool | None = None
+    """None: arming asks for no distance sensor, or there never was one."""
     attitude: bool = True
     velocity: bool = True
     """Horizontal, of the estimate."""
@@ -405,4 +423,19 @@ class AutopilotState(Protocol):
     @property
     def odometry_us(self) -> int:
         """When it was told [µs]."""
+        ...
+
+    @property
+    def distance(self) -> DistanceReading | None:
+        """The newest of a distance sensor; None before any."""
+        ...
+
+    @property
+    def distance_us(self) -> int:
+        """When it came [µs]."""
+        ...
+
+    @property
+    def clearance(self) -> Clearance | None:
+        """How far the ground is below; None before the first range."""
         ...

@@ -30,9 +30,11 @@ from firmware_sim.autopilot.filter_kernel import KernelFilter
 from firmware_sim.autopilot.fusion_horizon import FusionHorizon
 from firmware_sim.autopilot.magnetic_field import FieldCheck
 from firmware_sim.autopilot.measurement import Measurement, selecting
+from firmware_sim.autopilot.range_finder import Aids, RangeFinder
 from firmware_sim.autopilot.recovery import Moment, Recovery
+from firmware_sim.autopilot.terrain_filter import TerrainFilter
 from firmware_sim.autopilot.yaw_estimator import YawEstimator
-from firmware_sim.interfaces import GpsFix, Odometry, SensorSample
+from firmware_sim.interfaces import DistanceReading, GpsFix, Odometry, SensorSample
 
 _north, _east, _down = MAGNETIC_FIELD_NED
 # The field dips, so a tilt error turns the measured heading: seen from the world's axes,
@@ -88,6 +90,7 @@ class Estimator:
         horizontal = selecting(es.POS, es.POS + 1, es.VEL, es.VEL + 1)
         self._gps_horizontal = Measurement("gps_horizontal", 0, horizontal)
         self._gps_vertical = Measurement("gps_vertical", 3, selecting(es.POS + 2, es.VEL + 2))
+        self._gps_sinking = Measurement("gps_down_velocity", 3, selecting(es.VEL + 2))
         self._baro = Measurement("baro", 1, selecting(es.BARO) - selecting(es.POS + 2))
         self._heading = Measurement("heading", 2, np.zeros((1, es.N_STATES)))
         self._horizon = FusionHorizon()
@@ -103,6 +106,8 @@ class Estimator:
         """The newest pose that something else has estimated; None before any."""
         self.odometry_us = 0
         """When it was told [µs]."""
+        self.range: RangeFinder | None = None
+        """What tells how far the ground is below; None before the first range."""
         self._field: Vector | None = None
         """The newest that the compass has measured (3,) FRD [gauss]; before alignment the mean."""
 
@@ -125,6 +130,10 @@ class Estimator:
                 self.see(sample.odometry)
             elif self.vision.fused:
                 self.vision.look(sample.time_us)
+            if sample.distance is not None:
+                self.measure(sample.distance)
+            if self.range is not None:
+                self.range.step(sample.time_us, self._aids, flying=self.flying)
         converged = es.converged(self.state, self.filter.covariance)
         self.healthy = converged and self._aligned_us is not None
 
@@ -135,6 +144,20 @@ class Estimator:
             gps = self._uses_gps and self.fuses_gps(self._time_us)
             self.vision.take(odometry, self._time_us, gps=gps, flying=self.flying)
             self._estimate = None
+
+    def measure(self, reading: DistanceReading, source: int = 0) -> None:
+        """Take what a distance sensor measures now; 0 = the vehicle's own, else a client's."""
+        if self._aligned_us is None:
+            return
+        if self.range is None:
+            # From the first on the filter knows the ground, too.
+            terrain = TerrainFilter(self.filter)
+            self.filter = terrain
+            self.recovery.use(terrain)
+            self.vision.use(terrain)
+            self.range = RangeFinder(self._value, self.state, terrain, self._time_us)
+            self.vision.on_height_moved = self.range.moved
+        self.range.take(reading, self._time_us, source)
 
     def estimate(self) -> Estimate:
         """Return a copy of the estimate after the newest tick."""
@@ -168,6 +191,8 @@ class Estimator:
             return
         here = local_to_geodetic(self.state[es.P : es.V], before)
         self.state[es.P : es.V] = geodetic_to_local(here, origin)
+        if self.range is not None:
+            self.range.moved(origin.altitude_m - before.altitude_m)
         self._origin_altitude_baro += origin.altitude_m - before.altitude_m
         self.origin, self._estimate = origin, None
 
@@ -191,9 +216,22 @@ class Estimator:
     def knows_height(self, now_us: int) -> bool:
         """Return whether height and vertical speed are valid: barometer or GPS, as above."""
         longest_us = self._value("EKF2_NOAID_TOUT")
-        return self._aligned_us is not None and any(
-            self._recent(m, now_us, longest_us)
-            for m in (self._baro, self._gps_vertical, self.vision.height)
+        return self._aligned_us is not None and (
+            any(
+                self._recent(m, now_us, longest_us)
+                for m in (self._baro, self._gps_vertical, self.vision.height)
+            )
+            or (self.range is not None and self.range.told_height_since(now_us - longest_us))
+        )
+
+    def _aids(self) -> Aids:
+        """Return what measures the motion besides ranges."""
+        gps, seen = self._uses_gps and self.fuses_gps(self._time_us), self.vision.fused
+        told = (self._baro, self._gps_vertical, self.vision.height)
+        return Aids(
+            horizontal=gps or bool(seen & (Control.HORIZONTAL | Control.VELOCITY)),
+            vertical_speed=gps or bool(seen & Control.VELOCITY),
+            height_us=max(m.fused_us or 0 for m in told),
         )
 
     @property
@@ -306,7 +344,12 @@ class Estimator:
         m.innovation[1] = fix.velocity_ned[2] - then[5]
         # A receiver's height is about half as good as its horizontal position.
         m.variance[0], m.variance[1] = max(fix.epv_m, math.sqrt(r_p)) ** 2, r_v
-        if not self.vision.fused & Control.VERTICAL:
+        if self.range is not None and self.range.is_reference:
+            # Heights are counted from the ground: that of GPS would need a bias of its own.
+            sinking = self._gps_sinking
+            sinking.innovation[0], sinking.variance[0] = m.innovation[1], r_v
+            self._fuse(sinking)
+        elif not self.vision.fused & Control.VERTICAL:
             self._fuse(m)
 
     def _observe_yaw(self, velocity: Vector, accuracy: float) -> None:
@@ -326,7 +369,8 @@ class Estimator:
         expected = -self.state.item(es.P + 2) + self.state.item(es.BARO_OFFSET)
         self._baro.innovation[0] = height - expected
         self._baro.variance[0] = self._value("EKF2_BARO_NOISE") ** 2
-        self._fuse(self._baro)
+        if not self._fuse(self._baro) and self.range is not None:
+            self.range.correct(self._baro, self._time_us)
 
     def _fuse_heading(self, field: Vector) -> None:
         if self.vision.fused & Control.YAW or self._value("EKF2_MAG_TYPE") == _NO_COMPASS:

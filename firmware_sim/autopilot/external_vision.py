@@ -112,6 +112,12 @@ class ExternalVision:
         """Turns vision's frame into the filter's (quaternion)."""
         self._is_frame_known = False
         self._resets_left = RESETS
+        self.on_height_moved: Callable[[float], None] | None = None
+        """Called with how much further down [m] the vehicle is put where vision says so, if set."""
+
+    def use(self, error_filter: ErrorFilter) -> None:
+        """Go on with another filter, which carries the same errors."""
+        self._filter = error_filter
 
     def take(self, odometry: Odometry, now_us: int, *, gps: bool, flying: bool) -> None:
         """Fuse what of it is asked for.
@@ -318,6 +324,8 @@ class ExternalVision:
         moved = down - self._then().item(2)
         self._state[es.P + 2] += moved
         self._state[es.BARO_OFFSET] += moved
+        if self.on_height_moved is not None:
+            self.on_height_moved(moved)
         covariance = self._filter.covariance.copy()
         _forget(covariance, es.POS + 2, variance)
         self._filter.restart(covariance)

@@ -15,7 +15,7 @@ from firmware_sim.autopilot.events.definition import Event
 from firmware_sim.autopilot.manual_control import Source, Sticks
 from firmware_sim.autopilot.navigation.plan import Plans
 from firmware_sim.autopilot.requests import FollowedTarget, LandingTarget, Obstacles, Request
-from firmware_sim.interfaces import Odometry, SensorSample
+from firmware_sim.interfaces import DistanceReading, Odometry, SensorSample
 
 
 @dataclass(frozen=True, slots=True)
@@ -251,6 +251,10 @@ class AutopilotPort(Protocol):
 
     def see(self, odometry: Odometry) -> None:
         """Hand over a pose that something else has estimated, received now."""
+        ...
+
+    def measure_distance(self, reading: DistanceReading) -> None:
+        """Hand over what a client's distance sensor measures, received now."""
         ...
 
     def see_obstacles(self, obstacles: Obstacles) -> None:

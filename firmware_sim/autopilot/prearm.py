@@ -149,6 +149,18 @@ CHECKS: tuple[Check, ...] = (
         level=lambda _: Level.WARNING,
         shown=lambda _: _POSITION,
     ),
+    Check(
+        Part.DISTANCE_SENSOR,
+        lambda r: r.settings.sys_has_num_dist > 0 and r.distance is None,
+        "Preflight Fail: Distance Sensor 0 missing",
+        events.DISTANCE_SENSOR_MISSING,
+    ),
+    Check(
+        Part.DISTANCE_SENSOR,
+        lambda r: r.settings.sys_has_num_dist > 0 and r.distance is False,
+        "Preflight Fail: no valid data from distance sensor 0",
+        events.DISTANCE_SENSOR_INVALID,
+    ),
     _battery(BatteryWarning.LOW, "Low battery", events.BATTERY_LOW),
     _battery(BatteryWarning.CRITICAL, "Critical battery", events.BATTERY_CRITICAL),
     _battery(BatteryWarning.EMERGENCY, "Emergency battery level", events.BATTERY_EMERGENCY),

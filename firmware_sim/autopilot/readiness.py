@@ -21,6 +21,7 @@ class Part(IntFlag):
     MAG = auto()
     BARO = auto()
     GPS = auto()
+    DISTANCE_SENSOR = auto()
     BATTERY = auto()
     ESTIMATOR = auto()
     MANUAL_CONTROL = auto()
@@ -42,6 +43,7 @@ class ArmingSettings(NamedTuple):
     sys_has_baro: int = 1
     sys_has_gps: int = 1
     sys_has_mag: int = 1
+    sys_has_num_dist: int = 0
 
     @classmethod
     def read(cls, value: Callable[[str], float]) -> ArmingSettings:
@@ -73,6 +75,8 @@ class Readiness(NamedTuple):
     mag: bool = True
     baro: bool = True
     gps: bool = True
+    distance: bool | None = None
+    """Of the distance sensor; None: there is none."""
     rolled: bool = False
     """Roll is beyond FD_FAIL_R."""
     pitched: bool = False

@@ -48,6 +48,10 @@ class Recovery:
         self._biases_before = state[es.GYRO_BIAS : es.BARO_OFFSET].copy()
         """Of gyro and accelerometer (6,), before these were doubted."""
 
+    def use(self, error_filter: ErrorFilter) -> None:
+        """Go on with another filter, which carries the same errors."""
+        self._filter = error_filter
+
     def doubts_inertial(self, now_us: int) -> bool:
         """Return whether inertial data disagreed with what measures velocity lately."""
         restarted = self.consistency.restarted_us

@@ -15,6 +15,7 @@ from airl_mav.control.demand import AnyDemand, AttitudeDemand, RateDemand
 from airl_mav.control.mixer import Motors
 from airl_mav.core.frames import Geodetic
 from firmware_sim.autopilot.autopilot_state import (
+    Clearance,
     CommanderStatus,
     Estimate,
     FenceStatus,
@@ -35,7 +36,7 @@ from firmware_sim.autopilot.navigation.navigator import Navigator
 from firmware_sim.autopilot.navigation.plan import Plans
 from firmware_sim.autopilot.navigation.progress import progress
 from firmware_sim.autopilot.newest_sensors import NewestSensors
-from firmware_sim.interfaces import BatterySample, GpsFix, Odometry, SensorSample
+from firmware_sim.interfaces import BatterySample, DistanceReading, GpsFix, Odometry, SensorSample
 
 
 class Parts(NamedTuple):
@@ -195,6 +196,21 @@ class Snapshot:
     @property
     def odometry_us(self) -> int:
         return self._parts.estimator.odometry_us
+
+    @property
+    def distance(self) -> DistanceReading | None:
+        finder = self._parts.estimator.range
+        return None if finder is None else finder.reading
+
+    @property
+    def distance_us(self) -> int:
+        finder = self._parts.estimator.range
+        return 0 if finder is None else finder.reading_us
+
+    @property
+    def clearance(self) -> Clearance | None:
+        finder = self._parts.estimator.range
+        return None if finder is None else finder.clearance()
 
     @property
     def _setpoints(self) -> ControlSetpoints:

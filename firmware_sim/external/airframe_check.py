@@ -139,13 +139,14 @@ def ardupilot_airframe(vehicle: VehicleProfile) -> Airframe:
     )
 
 
-def refuse_vision(vehicle: VehicleProfile, firmware: str) -> None:
-    """Raise FirmwareMissingError for a vehicle whose vision no such firmware would be told of."""
-    if vehicle.sensors.vision is not None:
-        raise FirmwareMissingError(
-            f"--firmware {firmware}: the vehicle has sensors.vision, which only builtin and px4 are"
-            " told of"
-        )
+def refuse_untold(vehicle: VehicleProfile, firmware: str) -> None:
+    """Raise FirmwareMissingError for a vehicle with sensors that no such firmware is told of."""
+    for name in ("vision", "rangefinder"):
+        if getattr(vehicle.sensors, name) is not None:
+            raise FirmwareMissingError(
+                f"--firmware {firmware}: the vehicle has sensors.{name}, which only builtin and px4"
+                " are told of"
+            )
 
 
 def _ardupilot_problem(

@@ -17,7 +17,7 @@ from firmware_sim.external.airframe_check import (
     SITL_OUTPUT,
     ardupilot_airframe,
     px4_airframe,
-    refuse_vision,
+    refuse_untold,
 )
 from firmware_sim.external.ardupilot import program as ardupilot_program
 from firmware_sim.external.ardupilot.program import Links, find_arducopter
@@ -105,7 +105,7 @@ def _ardupilot(wanted: Wanted) -> tuple[Launcher, Endpoint]:
     options, ports = wanted.aircraft.real, wanted.aircraft.ports
     instance = options.instance
     airframe = ardupilot_airframe(wanted.vehicle)
-    refuse_vision(wanted.vehicle, "ardupilot")
+    refuse_untold(wanted.vehicle, "ardupilot")
     where = options.ardupilot_dir
     program = None if where is None else find_arducopter(where)
     # Who is started by us can be told any port.
@@ -130,7 +130,7 @@ def _ardupilot(wanted: Wanted) -> tuple[Launcher, Endpoint]:
 def _hitl(wanted: Wanted) -> tuple[Launcher, Endpoint]:
     options = wanted.aircraft.real
     airframe = px4_airframe(wanted.vehicle, HITL_OUTPUT)
-    refuse_vision(wanted.vehicle, "px4-hitl")
+    refuse_untold(wanted.vehicle, "px4-hitl")
     router = Router(wanted.bind_ends().by_name(), WallClock())
     try:
         link = BoardLink(router, options.serial or "", options.baud)

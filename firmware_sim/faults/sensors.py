@@ -17,7 +17,7 @@ from airl_mav.core.constants import TICK_S, US_PER_S
 from airl_mav.core.frames import Vector, local_to_geodetic
 from airl_mav.profiles.sensors import Sensors
 from firmware_sim.faults.timeline import Acting
-from firmware_sim.interfaces import GpsFix, Odometry, SensorSample
+from firmware_sim.interfaces import DistanceReading, GpsFix, Odometry, SensorSample
 from firmware_sim.plant.sensors import PA_PER_HPA
 
 FIELDS = {
@@ -27,6 +27,7 @@ FIELDS = {
     "baro": "pressure_hpa",
     "gps": "gps",
     "vision": "odometry",
+    "rangefinder": "distance",
 }
 """Field of a sample, by the sensor's name."""
 
@@ -127,14 +128,25 @@ class Noisy:
 
 
 def shifted(value: Any, offset: Vector) -> Any:
-    """Return a measured value with an error: of a fix, its position NED; of a pose, its own [m]."""
+    """Return a measured value with an error: of a fix, its position NED; of a pose, its own."""
     if isinstance(value, GpsFix):
         return value._replace(position=local_to_geodetic(offset, value.position))
     if isinstance(value, Odometry):
         return value if value.position is None else value._replace(position=value.position + offset)
+    if isinstance(value, DistanceReading):
+        return farther(value, offset.item(0))
     if isinstance(value, float):
         return value + offset.item(0)
     return value + offset
+
+
+def farther(told: DistanceReading, error_m: float) -> DistanceReading:
+    """Return a range with an error; beyond what the sensor measures it says so, as any other."""
+    if told.quality == 0:
+        return told
+    distance_m = max(0.0, told.distance_m + error_m)
+    within = told.least_m <= distance_m <= told.greatest_m
+    return told._replace(distance_m=distance_m, quality=told.quality if within else 0)
 
 
 def noise_sd(part: str, profile: Sensors, tick_s: float) -> Vector:
@@ -144,6 +156,7 @@ def noise_sd(part: str, profile: Sensors, tick_s: float) -> Vector:
     horizontal, speed = gps.horizontal_noise_m, gps.velocity_noise_m_s
     vision = profile.vision
     seen = (0.0, 0.0) if vision is None else (vision.position_noise_m, vision.velocity_noise_m_s)
+    ranges = profile.rangefinder
     known: dict[str, list[float]] = {
         "accel": [profile.imu.accel_noise_m_s2 * white] * 3,
         "gyro": [profile.imu.gyro_noise_rad_s * white] * 3,
@@ -151,6 +164,7 @@ def noise_sd(part: str, profile: Sensors, tick_s: float) -> Vector:
         "baro": [profile.barometer.noise_pa / PA_PER_HPA],
         "gps": [horizontal, horizontal, gps.vertical_noise_m, speed, speed, speed],
         "vision": [seen[0]] * 3 + [seen[1]] * 3,
+        "rangefinder": [0.0 if ranges is None else ranges.noise_m],
     }
     return np.array(known[part])
 

@@ -89,6 +89,8 @@ TOPICS: tuple[Logged, ...] = (
                 *_VALID,
                 "bool xy_global",
                 "bool z_global",
+                *("float dist_bottom", "float dist_bottom_var", "bool dist_bottom_valid"),
+                *("uint8_t dist_bottom_reset_counter", "uint8_t dist_bottom_sensor_bitfield"),
             ),
         ),
         100 * _EVERY_MS,
@@ -150,6 +152,19 @@ TOPICS: tuple[Logged, ...] = (
         ),
         40 * _EVERY_MS,
         values.visual_odometry,
+    ),
+    Logged(
+        Topic(
+            "distance_sensor",
+            (
+                *("uint32_t device_id", "float min_distance", "float max_distance"),
+                *("float current_distance", "float variance", "int8_t signal_quality"),
+                *("uint8_t type", "float h_fov", "float v_fov", "float[4] q"),
+                *("uint8_t orientation", "uint8_t mode"),
+            ),
+        ),
+        1_000 * _EVERY_MS,
+        values.distance_sensor,
     ),
     Logged(
         Topic(

@@ -44,6 +44,9 @@ POSE_FRAMES: dict[PoseFrame, int] = {"ned": 1, "frd": 2}
 VELOCITY_FRAMES: dict[VelocityFrame, int] = {"ned": 1, "frd": 2, "body": 3}
 """VehicleOdometry.velocity_frame."""
 
+DIST_BOTTOM_SENSOR_RANGE = 1
+"""VehicleLocalPosition.dist_bottom_sensor_bitfield."""
+
 MOTORS = 12
 """ActuatorMotors.NUM_CONTROLS: those that do not exist are NaN."""
 
@@ -127,6 +130,21 @@ def local_position(moment: Moment) -> Values:
         sigma[5],
         *(healthy,) * 4,
         *(known and healthy,) * 2,
+        *_clearance(state),
+    )
+
+
+def _clearance(state: AutopilotState) -> Values:
+    """Return how far the ground is below [m], how sure that is, and what says so."""
+    ground = state.clearance
+    if ground is None:
+        return _UNKNOWN, _UNKNOWN, False, 0, 0
+    return (
+        ground.dist_bottom_m,
+        ground.variance_m2,
+        ground.valid,
+        ground.resets % 256,
+        DIST_BOTTOM_SENSOR_RANGE if ground.by_range else 0,
     )
 
 
@@ -203,6 +221,27 @@ def visual_odometry(moment: Moment) -> Values | None:
         *numbers(told.velocity_variance, 3),
         told.reset_counter,
         told.quality,
+    )
+
+
+def distance_sensor(moment: Moment) -> Values | None:
+    """Return the newest range [m], of the first sensor."""
+    told = moment.state.distance
+    if told is None:
+        return None
+    number, enabled = 0, 1
+    return (
+        number,
+        told.least_m,
+        told.greatest_m,
+        told.distance_m,
+        told.variance_m2,
+        told.quality,
+        told.kind,
+        *(0.0, 0.0),
+        *(0.0, 0.0, 0.0, 0.0),
+        told.orientation,
+        enabled,
     )
 
 

@@ -2,8 +2,8 @@
 
 Messages that PX4 sends and we do not are left out: EVENT and CURRENT_EVENT_SEQUENCE,
 LINK_NODE_STATUS (its counts depend on when clients speak, and a flight's telemetry must not),
-OPEN_DRONE_ID_*, DISTANCE_SENSOR (the vehicle has no such device). The tables' order is the order on
-the wire when several messages are due in the same tick.
+OPEN_DRONE_ID_*. The tables' order is the order on the wire when several messages are due in the
+same tick.
 """
 
 from __future__ import annotations
@@ -46,6 +46,7 @@ ONBOARD_HZ: Mapping[str, float] = MappingProxyType(
         "ESC_INFO": 10.0,
         "ESC_STATUS": 10.0,
         "RC_CHANNELS": 20.0,
+        "DISTANCE_SENSOR": 10.0,
     }
 )
 """Onboard (API) link, 14580 -> 14540 [Hz]."""
@@ -79,6 +80,7 @@ GCS_HZ: Mapping[str, float] = MappingProxyType(
         "ESC_INFO": 1.0,
         "ESC_STATUS": 1.0,
         "RC_CHANNELS": 5.0,
+        "DISTANCE_SENSOR": 0.5,
     }
 )
 """Ground station link, 18570 -> 14550 [Hz]."""

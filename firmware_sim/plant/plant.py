@@ -29,6 +29,7 @@ from firmware_sim.plant.dynamics import (
     supply,
 )
 from firmware_sim.plant.kinematics import POSITION, QUATERNION, RATES, VELOCITY
+from firmware_sim.plant.rangefinder import PlantRangefinder
 from firmware_sim.plant.sensors import SensorSuite
 
 REST_SPEED_M_S = 0.1
@@ -91,6 +92,11 @@ class Plant:
         self._sensors = SensorSuite(profile.sensors, noise, tick_s, asked.sensors.navigation_noise)
         self.wind: Blowing = Wind(asked.wind, gusts, tick_s)
         """Asked once a tick for what blows; to be replaced between two ticks."""
+        fitted, times = profile.sensors.rangefinder, asked.sensors.navigation_noise
+        self._rangefinder = None
+        if fitted is not None:
+            # A further child: the streams of the other sensors stay what they are.
+            self._rangefinder = PlantRangefinder(fitted, arena, noise.spawn(1)[0], times)
         self._start_us = start_us
         self._moves_us = start_us
         """When moving obstacles set out."""
@@ -172,7 +178,12 @@ class Plant:
 
     def sense(self) -> SensorSample:
         """Return a sensor sample of the present state."""
-        return self._sensors.sample(self.time_us, self.motion, self._battery)
+        sample = self._sensors.sample(self.time_us, self.motion, self._battery)
+        finder = self._rangefinder
+        if finder is None or not finder.rate.due(self.time_us):
+            return sample
+        elapsed_us = self.time_us - self._moves_us
+        return sample._replace(distance=finder.read(self.motion, elapsed_us))
 
     def truth(self) -> Truth:
         """Return the true state."""

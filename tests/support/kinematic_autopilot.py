@@ -18,6 +18,7 @@ from airl_mav.core.frames import Geodetic, local_to_geodetic, quat_from_euler, w
 from airl_mav.profiles.parameters import SPECS
 from firmware_sim.autopilot.autopilot_state import (
     Arming,
+    Clearance,
     CommanderStatus,
     Estimate,
     FenceStatus,
@@ -38,7 +39,7 @@ from firmware_sim.autopilot.navigation.plan import Plans
 from firmware_sim.autopilot.navigation.progress import progress
 from firmware_sim.autopilot.port import Failures, LogStore, NoLogs, ParameterValue
 from firmware_sim.autopilot.requests import FollowedTarget, LandingTarget, Obstacles, Request
-from firmware_sim.interfaces import BatterySample, GpsFix, Odometry, SensorSample
+from firmware_sim.interfaces import BatterySample, DistanceReading, GpsFix, Odometry, SensorSample
 
 ORIGIN = Geodetic(47.397743, 8.545594, 489.4)
 READY_US = 100_000
@@ -93,6 +94,9 @@ class KnownState(NamedTuple):
     esc_outputs: tuple[float, float, float, float] | None = None
     odometry: Odometry | None = None
     odometry_us: int = 0
+    distance: DistanceReading | None = None
+    distance_us: int = 0
+    clearance: Clearance | None = None
 
 
 class Parameters:
@@ -171,6 +175,7 @@ class KinematicAutopilot:
         self.gyro = np.zeros(3)
         self.setpoints: list[tuple[Setpoint, int]] = []
         self.odometry: list[Odometry] = []
+        self.distances: list[DistanceReading] = []
         self.obstacles: list[Obstacles] = []
         self.gcs_heartbeats: list[int] = []
         self.takeoffs: list[float | None] = []
@@ -292,6 +297,9 @@ class KinematicAutopilot:
 
     def see(self, odometry: Odometry) -> None:
         self.odometry.append(odometry)
+
+    def measure_distance(self, reading: DistanceReading) -> None:
+        self.distances.append(reading)
 
     def landing_target(self, target: LandingTarget) -> None:
         self.landing_targets.append(target)

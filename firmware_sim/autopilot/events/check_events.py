@@ -74,6 +74,15 @@ GPS_FIX_TOO_LOW = _check(
     _C.GPS,
     description="Configured by <param>COM_ARM_WO_GPS</param>.",
 )
+DISTANCE_SENSOR_MISSING = _health(
+    "check_distance_sensor_missing", "Distance sensor {3} missing", _C.DISTANCE_SENSOR, *_FIRST
+)
+DISTANCE_SENSOR_INVALID = _health(
+    "check_distance_sensor_invalid",
+    "No valid data from distance sensor {3}",
+    _C.DISTANCE_SENSOR,
+    *_FIRST,
+)
 BATTERY_LOW = _check(
     "check_battery_low",
     "Low battery",

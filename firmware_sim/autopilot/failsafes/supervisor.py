@@ -31,6 +31,7 @@ from firmware_sim.autopilot.failsafes.settings import Settings
 from firmware_sim.autopilot.failsafes.watch import Watch
 from firmware_sim.autopilot.prearm import Check
 from firmware_sim.autopilot.readiness import ArmingSettings, Readiness
+from firmware_sim.autopilot.sensor_monitor import NO_DATA_US
 from firmware_sim.interfaces import SensorSample
 
 LOOK_US = 100_000
@@ -161,6 +162,7 @@ class Supervisor:
             mag=sensors.mag.has_data(now_us),
             baro=sensors.baro.has_data(now_us),
             gps=sensors.gps.has_data(now_us),
+            distance=self._ranges(now_us),
             rolled=attitude.roll,
             pitched=attitude.pitch,
             charge_short=sample.battery.remaining < self._arming.com_arm_bat_min,
@@ -178,6 +180,7 @@ class Supervisor:
             mag=mag and not self._estimator.recovery.compass.given_up,
             baro=baro,
             gps=gps,
+            distance=self._ranges(now_us) if self._arming.sys_has_num_dist > 0 else None,
             attitude=not seen.attitude_invalid,
             velocity=not seen.local_velocity_invalid,
             position=not seen.local_position_invalid,
@@ -186,6 +189,11 @@ class Supervisor:
             battery=seen.battery_warning < BatteryWarning.CRITICAL and not seen.battery_unhealthy,
             armable=self._armable,
         )
+
+    def _ranges(self, now_us: int) -> bool | None:
+        """Return whether a distance sensor tells anything; None: it never has."""
+        finder = self._estimator.range
+        return None if finder is None else now_us - finder.reading_us < NO_DATA_US
 
     def _report(self, now_us: int, flight: Flight) -> list[Message]:
         """Return the checks that have begun to fail, once the vehicle has been ready."""

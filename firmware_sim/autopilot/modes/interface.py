@@ -11,7 +11,7 @@ from airl_mav.control.demand import AnyDemand, AttitudeDemand, Demand, RateDeman
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Vector, quat_yaw
 from airl_mav.vehicle.rotation import Vec
-from firmware_sim.autopilot.autopilot_state import Message, OrbitStatus, Setpoint
+from firmware_sim.autopilot.autopilot_state import Clearance, Message, OrbitStatus, Setpoint
 from firmware_sim.autopilot.climb import Climb
 from firmware_sim.autopilot.error_state import RATES, P, Q
 from firmware_sim.autopilot.manual_control import Sticks
@@ -66,6 +66,8 @@ class FlightContext:
     """What a precision landing lands on, as it was reported last."""
     obstacles: Obstacles | None = None
     """Where obstacles are, as was told last."""
+    ground: Clearance | None = None
+    """How far the ground is below; None = nothing tells it."""
     orbit: OrbitStatus | None = None
     """The circle that was flown last."""
 
@@ -75,6 +77,17 @@ class FlightContext:
     def height(self, state: Vector) -> float:
         """Return the height above home [m]."""
         return self.home[2] - state.item(P + 2)
+
+    @property
+    def ground_m(self) -> float:
+        """How far the ground is below [m]; NaN = not known."""
+        ground = self.ground
+        return NAN if ground is None or not ground.valid else ground.dist_bottom_m
+
+    def over_ground(self, state: Vector) -> float:
+        """Return the height above ground [m], above home where the ground is not known."""
+        ground_m = self.ground_m
+        return self.height(state) if math.isnan(ground_m) else ground_m
 
 
 class FlightMode(Protocol):

@@ -44,7 +44,8 @@ class Land(FlightMode):
 
     def demand(self, state: Vector, _time_us: int, /) -> Demand:
         """Stop first, then hold that place; descend all the while."""
-        speed = landing_speed(self._context.value, self._context.height(state))
+        context = self._context
+        speed = landing_speed(context.value, context.height(state), context.ground_m)
         if self._stopping:
             north, east, _ = triple(state, V)
             if math.hypot(north, east) > STANDING_M_S:
@@ -54,8 +55,18 @@ class Land(FlightMode):
         return over(self._place, speed)
 
 
-def landing_speed(value: Callable[[str], float], height_m: float) -> float:
-    """Return how fast to descend [m/s]: PX4 slows down linearly between two heights [m]."""
+def landing_speed(value: Callable[[str], float], height_m: float, ground_m: float = NAN) -> float:
+    """Return how fast to descend [m/s]: PX4 slows down linearly between two heights.
+
+    Args:
+        value: Looks up a parameter.
+        height_m: Height above where it lands.
+        ground_m: How far the ground is below, which counts where it is known; NaN = it is not.
+    """
+    if not math.isnan(ground_m):
+        if ground_m <= value("MPC_LAND_ALT3"):
+            return value("MPC_LAND_CRWL")
+        height_m = ground_m
     low, high = value("MPC_LAND_ALT2"), value("MPC_LAND_ALT1")
     slow, fast = value("MPC_LAND_SPEED"), value("MPC_Z_V_AUTO_DN")
     if height_m <= low:

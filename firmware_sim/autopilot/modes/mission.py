@@ -65,7 +65,7 @@ class Mission(FlightMode):
         yaw = triplet.yaw if math.isfinite(triplet.yaw) else self._heading(state)
         leg, limits = _leg(triplet, position), self._limits(state)
         if triplet.kind is _LAND:
-            speed = landing_speed(context.value, context.height(state))
+            speed = landing_speed(context.value, context.height(state), context.ground_m)
             north, east, _ = triplet.target
             leg = Leg((north, east, math.nan), vertical_m_s=speed)
         return travel.fly(state, time_us, leg, yaw=yaw, limits=limits)

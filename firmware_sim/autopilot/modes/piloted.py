@@ -9,8 +9,21 @@ from airl_mav.control.demand import AnyDemand, TrajectoryDemand
 from airl_mav.core.frames import Vector, quat_yaw
 from firmware_sim.autopilot.error_state import RATES, P, Q, V
 from firmware_sim.autopilot.manual_control import Sticks
-from firmware_sim.autopilot.modes.interface import FlightContext, FlightMode, descend, since
-from firmware_sim.autopilot.modes.stick_motion import AxisDemand, VerticalStick, YawStick
+from firmware_sim.autopilot.modes.interface import (
+    FlightContext,
+    FlightMode,
+    descend,
+    since,
+    triple,
+)
+from firmware_sim.autopilot.modes.stick_motion import (
+    AxisDemand,
+    VerticalStick,
+    YawStick,
+    deadzone,
+    expo,
+)
+from firmware_sim.autopilot.modes.terrain_hold import Piloting, TerrainHold
 from firmware_sim.autopilot.requests import Request
 
 LIFTING_THROTTLE = 0.3
@@ -24,6 +37,7 @@ class Piloted(FlightMode):
         self._context = context
         self._vertical = VerticalStick(context.value)
         self._turning = YawStick(context.value)
+        self._terrain = TerrainHold(context.value)
         self._time_us: int | None = None
         self._yaw = 0.0
 
@@ -37,6 +51,7 @@ class Piloted(FlightMode):
         """Begin with the present motion."""
         self._vertical.restart(state.item(P + 2), state.item(V + 2))
         self._turning.restart()
+        self._terrain.restart()
         self._yaw, self._time_us = quat_yaw(state[Q:RATES]), None
 
     def demand(self, state: Vector, time_us: int, /) -> AnyDemand:
@@ -50,8 +65,10 @@ class Piloted(FlightMode):
             return descend(yaw)
         now = quat_yaw(state[Q:RATES])
         yaw, rate = self._turning.turn(sticks.yaw, now, dt)
-        height = self._context.height(state)
+        height = self._context.over_ground(state)
         z = self._vertical.move(sticks.throttle, state.item(P + 2), height, dt)
+        if self._context.ground is not None:
+            z = self._over_ground(sticks, state, z)
         x, y = self._steer(sticks, now if math.isnan(yaw) else yaw, state, dt)
         return TrajectoryDemand(
             (x.position, y.position, z.position),
@@ -60,6 +77,28 @@ class Piloted(FlightMode):
             yaw,
             rate,
         )
+
+    def _over_ground(self, sticks: Sticks, state: Vector, z: AxisDemand) -> AxisDemand:
+        """Return the vertical demand where the ground is held, and not the altitude."""
+        value, hold, (vn, ve, vd) = self._context.value, self._terrain, triple(state, V)
+        zone = value("MPC_HOLD_DZ")
+        share = value("MPC_XY_MAN_EXPO")
+        level = (expo(deadzone(s, zone), share) for s in (sticks.pitch, sticks.roll))
+        ground = self._context.ground
+        before, down = hold.holds, state.item(P + 2)
+        now = Piloting(
+            level=math.hypot(*level),
+            climbing=deadzone(sticks.throttle, zone) != 0.0,
+            speed_m_s=math.hypot(vn, ve),
+            climb_m_s=vd,
+            down_m=down,
+            ground_m=self._context.ground_m,
+            resets=0 if ground is None else ground.resets,
+        )
+        place = hold.place(now, z.position)
+        if before and not hold.holds:
+            place = self._vertical.put(down)
+        return z._replace(position=place)
 
     @abstractmethod
     def _steer(

@@ -100,7 +100,8 @@ class PrecisionLand(FlightMode):
         north, east, _ = self._goal
         travel = self._context.travel
         if self._state in _DOWNWARDS:
-            speed = landing_speed(self._context.value, self._context.height(state))
+            context = self._context
+            speed = landing_speed(context.value, context.height(state), context.ground_m)
             return travel.fly(state, time_us, Leg((north, east, math.nan), vertical_m_s=speed))
         return travel.fly(state, time_us, Leg(self._goal))
 

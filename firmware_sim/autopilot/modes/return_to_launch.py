@@ -104,7 +104,8 @@ class ReturnToLaunch(FlightMode):
         if self._stage is _Stage.LAND and self._precise:
             return self._precision.demand(state, time_us)
         if self._stage is _Stage.LAND:
-            speed = landing_speed(self._context.value, self._height(state))
+            context = self._context
+            speed = landing_speed(context.value, self._height(state), context.ground_m)
             leg = Leg((north, east, math.nan), vertical_m_s=speed)
             return travel.fly(state, time_us, leg, yaw=self._home.yaw)
         leg = Leg((north, east, self._waiting_down))

@@ -108,6 +108,13 @@ class VerticalStick:
         axis.plan(wanted, limit, value("MPC_JERK_MAX"))
         return AxisDemand(self._held, axis.velocity, axis.acceleration)
 
+    def put(self, down: float) -> float:
+        """Go on from another height NED [m]; return what is held of it, NaN = nothing."""
+        self._axis.position = down
+        if not math.isnan(self._held):
+            self._held = down
+        return self._held
+
     def _speed(self, shaped: float, height: float) -> float:
         """Return the speed NED [m/s], slower near the ground."""
         value = self._value

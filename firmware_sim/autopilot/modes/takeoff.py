@@ -102,7 +102,7 @@ def leave_ground(context: FlightContext, state: Vector, time_us: int) -> Demand:
 def gentle(limits: PathLimits, context: FlightContext, state: Vector) -> PathLimits:
     """Return the limits of a take-off: near the ground it climbs as slowly as MPC_TKO_SPEED."""
     value = context.value
-    if context.height(state) >= value("MPC_LAND_ALT1"):
+    if context.over_ground(state) >= value("MPC_LAND_ALT1"):
         return limits
     speed = value("MPC_TKO_SPEED")
     acceleration = min(limits.up_m_s2, speed / max(value("MPC_TKO_RAMP_T"), 1e-3))

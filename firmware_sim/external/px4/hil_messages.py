@@ -13,7 +13,13 @@ from typing import NamedTuple, TypeAlias
 from airl_mav.core.constants import DEG, GRAVITY_M_S2
 from airl_mav.core.frames import Geodetic, Vector
 from airl_mav.vehicle.atmosphere import altitude_m
-from firmware_sim.interfaces import ActuatorControls, GpsFix, Odometry, SensorSample
+from firmware_sim.interfaces import (
+    ActuatorControls,
+    DistanceReading,
+    GpsFix,
+    Odometry,
+    SensorSample,
+)
 from firmware_sim.mavlink.codec import Reader, Values, WireMessage, dialect, layout
 from firmware_sim.mavlink.streams.units import triangle
 
@@ -21,6 +27,7 @@ SENSOR = layout("HIL_SENSOR")
 GPS = layout("HIL_GPS")
 STATE = layout("HIL_STATE_QUATERNION")
 ODOMETRY = layout("ODOMETRY")
+DISTANCE = layout("DISTANCE_SENSOR")
 
 
 class Answer(NamedTuple):
@@ -76,6 +83,7 @@ GYRO_LIMIT_RAD_S = 32_767 / 32_768 * 2000.0 * DEG
 """Range of the inertial sensors that PX4's drivers simulate: 16 g, 2000 deg/s in 16 bits. What lies
 beyond would wrap around: a hard landing (0.7 m/s stopped within a tick) would look like a fall."""
 
+_UINT8 = (0, 255)
 _INT16 = (-32_768, 32_767)
 _UINT16 = (0, 65_535)
 _INT32 = (-(2**31), 2**31 - 1)
@@ -144,6 +152,24 @@ def odometry(seen: Odometry, time_us: int) -> Values:
         seen.reset_counter,
         dialect.MAV_ESTIMATOR_TYPE_VIO,
         seen.quality,
+    )
+
+
+def distance(told: DistanceReading, time_us: int) -> Values:
+    """Return DISTANCE_SENSOR at the firmware's time [µs]: whole centimetres, as the message has."""
+    quality = 0 if told.quality < 0 else 1 + round(told.quality * 0.99)
+    return (
+        time_us // 1_000 & 0xFFFF_FFFF,
+        _fit(told.least_m * _CM, _UINT16),
+        _fit(told.greatest_m * _CM, _UINT16),
+        _fit(told.distance_m * _CM, _UINT16),
+        told.kind,
+        _ID,
+        told.orientation,
+        _fit(told.variance_m2 * _CM * _CM, _UINT8),
+        *(0.0, 0.0),
+        *(0.0, 0.0, 0.0, 0.0),
+        quality,
     )
 
 

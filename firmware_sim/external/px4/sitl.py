@@ -210,6 +210,9 @@ class Px4Bridge:
         if sample.odometry is not None:
             seen = hil.odometry(sample.odometry, now_us)
             data += encoder.frame(hil.ODOMETRY, hil.ODOMETRY.payload(seen))
+        if sample.distance is not None:
+            told = hil.distance(sample.distance, now_us)
+            data += encoder.frame(hil.DISTANCE, hil.DISTANCE.payload(told))
         if now_us >= self._state_due_us and self._truth is not None:
             # Keeps its phase, skips what it missed.
             late_us = now_us - self._state_due_us

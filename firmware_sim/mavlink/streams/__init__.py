@@ -13,6 +13,7 @@ from firmware_sim.autopilot.autopilot_state import AutopilotState
 from firmware_sim.mavlink.codec import Values
 from firmware_sim.mavlink.streams import (
     actuators,
+    distance,
     flight_modes,
     gimbal,
     high_latency,
@@ -66,6 +67,8 @@ BUILDERS: Mapping[str, Builder] = MappingProxyType(
         "FLIGHT_INFORMATION": information.flight_information,
         "PROTOCOL_VERSION": information.protocol_version,
         "HIGH_LATENCY2": high_latency.high_latency2,
+        # Last, as it came last: where streams begin depends on their order.
+        "DISTANCE_SENSOR": distance.distance_sensor,
     }
 )
 """Streams that need the snapshot only; the server adds those that need more."""

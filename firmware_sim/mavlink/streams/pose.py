@@ -15,6 +15,7 @@ from airl_mav.vehicle.rotation import Vec, rotate, yaw_of
 from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Vector
 from firmware_sim.mavlink.codec import Values, dialect
 from firmware_sim.mavlink.streams import units
+from firmware_sim.mavlink.streams.distance import clearance
 
 register_jitable(local_to_geodetic)  # so that kernels can call it, as Python can
 
@@ -98,9 +99,9 @@ def odometry(state: AutopilotState) -> Values:
 
 
 def altitude(state: AutopilotState) -> Values:
-    """All altitudes [m]; there is no rangefinder, so terrain is unknown."""
+    """All altitudes [m]; terrain is known where a rangefinder tells it."""
     down = float(state.estimate.position[2])
-    altitude_terrain = bottom_clearance = math.nan
+    altitude_terrain, bottom_clearance = clearance(state, down)
     return (
         state.time_us,
         atmosphere.altitude_m(state.pressure_hpa),

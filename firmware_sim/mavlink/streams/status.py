@@ -84,6 +84,7 @@ _ALL_AUXILIARY = 0b1111_1100
 """MANUAL_CONTROL.enabled_extensions: PX4 has six auxiliary axes, at rest here."""
 
 _RADIO = dialect.MAV_SYS_STATUS_SENSOR_RC_RECEIVER
+_RANGES = dialect.MAV_SYS_STATUS_SENSOR_LASER_POSITION
 _NONE_EXTENDED, _PARACHUTE = 0, dialect.MAV_SYS_STATUS_RECOVERY_SYSTEM
 
 
@@ -129,6 +130,8 @@ def sys_status(state: AutopilotState) -> Values:
         present |= _LOGGED
     if state.sticks is not None:
         present |= _RADIO
+    if state.health.distance is not None:
+        present |= _RANGES
     healthy: int = _NEVER_WRONG
     unhealthy: int = 0
     for good, bit in _health(state):
@@ -169,6 +172,8 @@ def _health(state: AutopilotState) -> Iterator[tuple[bool, int]]:
     yield located, dialect.MAV_SYS_STATUS_SENSOR_XY_POSITION_CONTROL
     yield health.battery, dialect.MAV_SYS_STATUS_SENSOR_BATTERY
     yield state.sticks is not None, _RADIO
+    if health.distance is not None:
+        yield health.distance, _RANGES
 
 
 def estimator_status(state: AutopilotState) -> Values:
@@ -177,7 +182,8 @@ def estimator_status(state: AutopilotState) -> Values:
     flags = _estimator_flags(state) if _knows(state) else 0
     horizontal, height, mag, vertical = estimate.innovation_ratio.tolist()
     north, east, down = estimate.sigma[:3].tolist()
-    airspeed = terrain = math.nan
+    airspeed, ground = math.nan, state.clearance
+    terrain = math.nan if ground is None else ground.ratio
     ratios = (max(horizontal, vertical), horizontal, height, mag, terrain, airspeed)
     return estimate.time_us, flags, *ratios, math.hypot(north, east), down
 
@@ -211,6 +217,10 @@ def _estimator_flags(state: AutopilotState) -> int:
         ),
         (bool(state.estimate.innovation_ratio[0] > 1.0), dialect.ESTIMATOR_GPS_GLITCH),
         (health.accel_error, dialect.ESTIMATOR_ACCEL_ERROR),
+        (
+            state.clearance is not None and state.clearance.valid,
+            dialect.ESTIMATOR_POS_VERT_AGL,
+        ),
         # A disarmed vehicle is known to stand.
         (state.status.arming is not Arming.ARMED, dialect.ESTIMATOR_CONST_POS_MODE),
     ):

@@ -1,0 +1,399 @@
+"""A rangefinder that looks down: where the ground is, and how high the vehicle is above it.
+
+EKF2_RNG_CTRL says whether it also tells the height: 0 never, 1 while low and slow, 2 always; where
+the ground is it tells anyway. With EKF2_HGT_REF = 2 the ground is where height is counted from.
+Source: PX4 1.16, EKF/aid_sources/range_finder/range_height_control.cpp, terrain_control.cpp.
+Not taken over: limits of what is flown by a vehicle whose height nothing else tells (there is
+always a barometer), and the wider gate while vertical acceleration is known to be wrong.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from enum import IntEnum
+from typing import NamedTuple
+
+from airl_mav.core.constants import US_PER_S
+from airl_mav.core.frames import Vector
+from airl_mav.vehicle.rotation import rotate
+from firmware_sim.autopilot import error_state as es
+from firmware_sim.autopilot.autopilot_state import Clearance
+from firmware_sim.autopilot.measurement import Measurement
+from firmware_sim.autopilot.range_sensor import LONGEST_INTERVAL_US, RangeConsistency, RangeSensor
+from firmware_sim.autopilot.terrain_filter import TerrainFilter
+from firmware_sim.interfaces import DOWNWARD, DistanceReading
+
+HEIGHT_BY_RANGE = 2
+"""EKF2_HGT_REF."""
+
+STEP_US = 10_000
+"""PX4's filter looks at the sensor a hundred times a second [µs]."""
+
+TIMEOUT_US = 5 * US_PER_S
+"""Refused for so long, it is taken over (hgt_fusion_timeout_max) [µs]."""
+
+_LEAST_VARIANCE = 1e-3
+"""Of a range, where its changes are looked at [m²]."""
+_STANDING = 0.1
+"""Below this square of its speed a vehicle does not move sideways [m²/s²]."""
+
+_TO_BEGIN = 0.7
+"""Share of the limits of EKF2_RNG_A_* within which conditional fusion begins."""
+_STEADY = 0.01
+"""Test ratio within which it begins."""
+
+_UNUSED_US = US_PER_S
+"""On the ground: after so long without ranges the ground is taken to be EKF2_MIN_RNG below."""
+
+_FILTERED_TAU_S, _GREATEST_RATIO = 0.5, 4.0
+
+
+class RangeControl(IntEnum):
+    """EKF2_RNG_CTRL."""
+
+    OFF = 0
+    CONDITIONAL = 1
+    ON = 2
+
+
+class Aids(NamedTuple):
+    """What else tells the vehicle's motion."""
+
+    horizontal: bool
+    """Whether anything measures horizontal motion."""
+    vertical_speed: bool
+    """Whether anything measures vertical speed."""
+    height_us: int
+    """When anything but ranges has told the height last [µs]."""
+
+
+class RangeFinder:
+    """Takes the ranges of one sensor and has the filter fuse what of them is asked for."""
+
+    def __init__(
+        self, value: Callable[[str], float], state: Vector, terrain: TerrainFilter, now_us: int
+    ) -> None:
+        """Begin without any.
+
+        Args:
+            value: Looks up EKF2_* parameters by name.
+            state: The nominal state, by `error_state`'s layout; updated.
+            terrain: The filter.
+            now_us: Now.
+        """
+        self._value, self._state, self.terrain = value, state, terrain
+        self.sensor, self.consistency = RangeSensor(), RangeConsistency()
+        self.tells_height, self.tells_ground = False, False
+        """What is being fused."""
+        self.is_reference = False
+        """Whether height is counted from the ground that ranges tell."""
+        self.fused_us: int | None = None
+        """When a range was last within the gate; None = never."""
+        self.innovation, self.ratio = 0.0, 0.0
+        """Of the newest range [m]; test ratio, 1 = at the gate."""
+        self._filtered_ratio = 0.0
+        self._tested_us = 0
+        self._ground_us: int | None = None
+        """When ranges last said where the ground is."""
+        self._valid = False
+        self._resets = 0
+        self._flying = False
+        self._waiting: DistanceReading | None = None
+        self._source: int | None = None
+        """Whose ranges are taken; None = of whoever sends the first."""
+        self._last_us = now_us
+        """When one of these came last."""
+        self.reading: DistanceReading | None = None
+        """The newest of any distance sensor, wherever it looks."""
+        self.reading_us = 0
+        """When it came [µs]."""
+        self._step = -1
+        self._begin_ground()
+
+    def take(self, reading: DistanceReading, now_us: int, source: int) -> None:
+        """Take a range, fused in the next step where the sensor looks down.
+
+        Of several such sensors the first is taken, until it has been silent for a second (PX4:
+        EKF2::UpdateRangeSample).
+        """
+        self.reading, self.reading_us = reading, now_us
+        if reading.orientation != DOWNWARD or not math.isfinite(reading.distance_m):
+            return
+        if source != self._source:
+            if self._source is not None and now_us - self._last_us <= US_PER_S:
+                return
+            self._source = source
+        self._waiting, self._last_us = reading, now_us
+
+    def step(self, now_us: int, aids: Callable[[], Aids], *, flying: bool) -> None:
+        """Fuse a range that has come, and look whether they still come; once a tick.
+
+        Args:
+            now_us: Now.
+            aids: Tells what else measures the vehicle's motion.
+            flying: Whether the vehicle is in the air.
+        """
+        step = now_us // STEP_US
+        if self._waiting is None and step == self._step:
+            return
+        self._step = step
+        self._check(now_us, flying=flying)
+        if self.sensor.is_new:
+            self._control(now_us, aids())
+        elif self._fuses and now_us - self._last_us > 2 * LONGEST_INTERVAL_US:
+            self._stop()
+        self._follow_ground(now_us, flying=flying)
+        self.sensor.is_new = False
+        value, terrain = self._value, self.terrain
+        free = not self.is_reference
+        terrain.walk_m_s = value("EKF2_TERR_NOISE") if free else 0.0
+        terrain.slope = value("EKF2_TERR_GRAD")
+
+    def clearance(self) -> Clearance:
+        """Return how far the ground is below."""
+        ratio = math.sqrt(abs(self._filtered_ratio)) if self.tells_ground else math.nan
+        return Clearance(
+            max(self._clearance_m, 0.0),
+            self._valid,
+            self.terrain.variance,
+            self.tells_ground,
+            self._resets,
+            ratio,
+        )
+
+    def moved(self, down_m: float) -> None:
+        """Note that all heights are counted from elsewhere: down is this much more [m]."""
+        self.terrain.down += down_m
+        self._resets += 1
+
+    def told_height_since(self, since_us: float) -> bool:
+        """Return whether a range has told how high the vehicle is since then [µs]."""
+        return self.tells_height and self.fused_us is not None and self.fused_us >= since_us
+
+    def correct(self, baro: Measurement, now_us: int) -> None:
+        """Take a barometer for offset that has been refused for long, where the ground counts.
+
+        Source: PX4 1.16, EKF/aid_sources/barometer: it is stopped, and begins with a new bias.
+        """
+        refused_us = now_us - (baro.fused_us or 0)
+        if not (self.is_reference and refused_us > TIMEOUT_US):
+            return
+        self._state[es.BARO_OFFSET] += baro.innovation.item(0)
+        covariance = self.terrain.covariance.copy()
+        covariance[es.BARO, :] = covariance[:, es.BARO] = 0.0
+        covariance[es.BARO, es.BARO] = es.INITIAL_SIGMA.item(es.BARO) ** 2
+        self.terrain.restart(covariance)
+        baro.fused_us = now_us
+
+    @property
+    def _clearance_m(self) -> float:
+        return self.terrain.down - self._state.item(es.P + 2)
+
+    @property
+    def _fuses(self) -> bool:
+        return self.tells_height or self.tells_ground
+
+    # --- the sensor
+
+    def _check(self, now_us: int, *, flying: bool) -> None:
+        sensor, value = self.sensor, self._value
+        if self._waiting is not None:
+            sensor.take(self._waiting, now_us)
+            self._waiting = None
+        sensor.quality_s, sensor.fog_m = value("EKF2_RNG_QLTY_T"), value("EKF2_RNG_FOG")
+        q, pitch = es.attitude(self._state), value("EKF2_RNG_PITCH")
+        ray = rotate(q, (math.sin(pitch), 0.0, math.cos(pitch)))
+        sensor.check(now_us, ray[2])
+        if sensor.is_healthy:
+            x, y, z = (value(f"EKF2_RNG_POS_{axis}") for axis in "XYZ")
+            sensor.range_m += rotate(q, (x, y, z))[2] / sensor.cos_tilt
+            if flying:
+                self._compare(now_us)
+        elif not flying and sensor.is_regular and sensor.is_new:
+            # Too near to be measured: as far as it is known to be on the ground.
+            sensor.range_m, sensor.is_valid = value("EKF2_MIN_RNG"), True
+
+    def _compare(self, now_us: int) -> None:
+        """Hold a range against the vertical speed."""
+        value, sensor, p = self._value, self.sensor, self.terrain.covariance
+        north, east, down = self._state[es.V : es.Q].tolist()
+        spread = float(p[es.VEL, es.VEL] + p[es.VEL + 1, es.VEL + 1])
+        scaled = value("EKF2_RNG_SFE") * sensor.dist_bottom_m
+        self.consistency.update(
+            sensor.dist_bottom_m,
+            max(value("EKF2_RNG_NOISE") ** 2 + scaled**2, _LEAST_VARIANCE),
+            down,
+            float(p[es.VEL + 2, es.VEL + 2]),
+            value("EKF2_RNG_K_GATE"),
+            now_us,
+            sideways=north * north + east * east > max(spread, _STANDING),
+        )
+
+    # --- fusion
+
+    def _control(self, now_us: int, aids: Aids) -> None:
+        value, sensor = self._value, self.sensor
+        control = int(value("EKF2_RNG_CTRL"))
+        self.terrain.horizon.assume(value("EKF2_RNG_DELAY"))
+        measured, variance = self._measure(now_us)
+        goes_on = (
+            control in (RangeControl.CONDITIONAL, RangeControl.ON)
+            and sensor.is_healthy
+            and self.consistency.is_consistent
+        )
+        conditional = (
+            self._fuses and control == RangeControl.CONDITIONAL and self._is_suitable(aids)
+        )
+        always = self._fuses and control == RangeControl.ON
+        if self.tells_height:
+            if not (conditional or always):
+                self._stop_height()
+        elif conditional or always:
+            self._begin_height(measured, variance, now_us, always=always)
+        if not self._fuses:
+            if goes_on and sensor.is_regular:
+                if self.ratio > 1.0:
+                    self._put_ground(variance, now_us)
+                self.tells_ground = True
+        elif goes_on:
+            self._fuse(measured, variance, now_us, aids)
+        else:
+            self._stop()
+
+    def _measure(self, now_us: int) -> tuple[float, float]:
+        """Return the newest height above ground [m] and its variance; note how it fits."""
+        value, sensor, p = self._value, self.sensor, self.terrain.covariance
+        measured = max(sensor.dist_bottom_m, value("EKF2_MIN_RNG"))
+        scaled = value("EKF2_RNG_SFE") * sensor.range_m
+        # PX4 adds the variance of the vehicle's height to that of the sensor.
+        variance = float(p[es.POS + 2, es.POS + 2]) + value("EKF2_RNG_NOISE") ** 2 + scaled**2
+        state, horizon = self._state, self.terrain.horizon
+        then = horizon.seen_from(state).item(2) if horizon.is_past else state.item(es.P + 2)
+        self.innovation = measured - (self.terrain.down - then)
+        total = self.terrain.clearance_variance() + variance
+        gate = max(value("EKF2_RNG_GATE"), 1.0)
+        self.ratio = self.innovation**2 / (gate**2 * total)
+        self._filter_ratio(now_us)
+        return measured, variance
+
+    def _filter_ratio(self, now_us: int) -> None:
+        """Take the newest test ratio into their mean (updateAidSourceStatus)."""
+        dt = min(1.0, max(0.001, (now_us - self._tested_us) / US_PER_S))
+        signed = math.copysign(self.ratio, -self.innovation)
+        if self._tested_us == 0:
+            self._filtered_ratio = self.ratio
+        else:
+            share = dt / (dt + _FILTERED_TAU_S)
+            mean = self._filtered_ratio + share * (signed - self._filtered_ratio)
+            self._filtered_ratio = min(_GREATEST_RATIO, max(-_GREATEST_RATIO, mean))
+        self._tested_us = now_us
+
+    def _is_suitable(self, aids: Aids) -> bool:
+        """Return whether the vehicle is so low and slow that ranges may tell its height."""
+        value, (north, east) = self._value, self._state[es.V : es.V + 2].tolist()
+        share, steady = (1.0, 1.0) if self.tells_height else (_TO_BEGIN, _STEADY)
+        slow = math.hypot(north, east) <= share * value("EKF2_RNG_A_VMAX")
+        low = self._clearance_m < share * value("EKF2_RNG_A_HMAX")
+        return low and self.ratio < steady and (slow or not aids.horizontal)
+
+    def _begin_height(self, measured: float, variance: float, now_us: int, *, always: bool) -> None:
+        self.tells_height = True
+        if int(self._value("EKF2_HGT_REF")) != HEIGHT_BY_RANGE:
+            if self.ratio > 1.0:
+                self._put_ground(variance, now_us)
+            return
+        self.is_reference = True
+        if always:
+            # From here on height is counted from the ground.
+            self._put_height(measured, variance)
+            self.terrain.down = 0.0
+            self._agree(now_us)
+        elif self.ratio > 1.0:
+            self._put_ground(variance, now_us)
+        self.tells_ground = False
+
+    def _fuse(self, measured: float, variance: float, now_us: int, aids: Aids) -> None:
+        if self.ratio <= 1.0:
+            self.terrain.fuse_range(
+                self._state,
+                self.innovation,
+                variance,
+                height=self.tells_height,
+                ground=self.tells_ground,
+            )
+            self.fused_us = now_us
+            if self.tells_ground:
+                self._ground_us = now_us
+        alone = now_us - aids.height_us > TIMEOUT_US
+        if alone and self.tells_height and self.is_reference:
+            # PX4 moves the ground with the vehicle here, which then wanders with every range.
+            ground = self.terrain.down
+            self._put_height(measured - ground, None)
+            self.terrain.down = ground
+            if not aids.vertical_speed:
+                self._state[es.V + 2] = 0.0
+            self._agree(now_us)
+        elif self.fused_us is None or now_us - self.fused_us > TIMEOUT_US:
+            self._put_ground(variance, now_us)
+
+    def _agree(self, now_us: int) -> None:
+        """Note that what is estimated has been made what was measured."""
+        self.innovation = self.ratio = self._filtered_ratio = 0.0
+        self.fused_us = now_us
+
+    def _put_ground(self, variance: float, now_us: int) -> None:
+        """Put the ground where the newest range says."""
+        self.terrain.put_by_range(self.innovation, variance)
+        self._resets += 1
+        self._agree(now_us)
+
+    def _put_height(self, height_m: float, variance: float | None) -> None:
+        """Put the vehicle elsewhere; the barometer's offset and the ground go with it.
+
+        Args:
+            height_m: Above z = 0.
+            variance: Of that [m²]; None = as it was.
+        """
+        state, p = self._state, self.terrain.covariance
+        moved = -height_m - state.item(es.P + 2)
+        state[es.P + 2] += moved
+        state[es.BARO_OFFSET] += moved
+        if variance is not None:
+            covariance, z = p.copy(), es.POS + 2
+            covariance[z, :] = covariance[:, z] = 0.0
+            covariance[z, z] = variance
+            self.terrain.restart(covariance)
+        self.moved(moved)
+
+    def _stop_height(self) -> None:
+        self.tells_height = self.is_reference = False
+
+    def _stop(self) -> None:
+        self._stop_height()
+        self.tells_ground = False
+
+    # --- the ground
+
+    def _begin_ground(self) -> None:
+        """Take the ground to be as far below as it is known to be on the ground."""
+        least = self._value("EKF2_MIN_RNG")
+        self.terrain.put(self._state.item(es.P + 2) + least, least**2)
+
+    def _follow_ground(self, now_us: int, *, flying: bool) -> None:
+        """Keep the ground known where nothing measures it, and judge what is known of it."""
+        unused = self._ground_us is None or now_us - self._ground_us > _UNUSED_US
+        if flying:
+            if not self._flying:
+                self._begin_ground()
+        elif not self.tells_ground and unused and not self.is_reference:
+            self._begin_ground()
+        self._flying = flying
+        clearance, spread = self._clearance_m, self.terrain.clearance_variance()
+        possible = clearance >= 0.0 and self._ground_us is not None and spread > 0.0
+        if self._valid:
+            self._valid = possible and spread < max(0.1 * clearance, 0.5) ** 2
+        else:
+            fused = self.fused_us
+            recent = fused is not None and now_us - fused <= TIMEOUT_US
+            self._valid = possible and self.tells_ground and recent

@@ -1,0 +1,55 @@
+"""What a distance sensor says, and how far the ground is below.
+
+Source: PX4 1.16, streams/DISTANCE_SENSOR.hpp and ALTITUDE.hpp.
+"""
+
+from __future__ import annotations
+
+import math
+
+from firmware_sim.autopilot.autopilot_state import AutopilotState
+from firmware_sim.mavlink.codec import Values
+from firmware_sim.mavlink.streams import units
+
+NEW_US = 200_000
+"""PX4 sends a distance once. Here it is sent while it is not older than this, the longest time that
+its estimator waits for the next [µs]."""
+
+_CM, _CM2 = 1e2, 1e4
+_FIRST = 0
+_NO_FIELD_OF_VIEW = (0.0, 0.0)
+_NO_QUATERNION = (0.0, 0.0, 0.0, 0.0)
+_QUALITY_NOT_TOLD = 0
+
+
+def distance_sensor(state: AutopilotState) -> Values | None:
+    """The newest distance [cm]; nothing where none comes. PX4 does not send its quality."""
+    told = state.distance
+    if told is None or state.time_us - state.distance_us > NEW_US:
+        return None
+    return (
+        units.boot_ms(state.distance_us),
+        _whole(told.least_m * _CM),
+        _whole(told.greatest_m * _CM),
+        _whole(told.distance_m * _CM),
+        told.kind,
+        _FIRST,
+        told.orientation,
+        units.saturate(math.floor(told.variance_m2 * _CM2), 0, 255, 0),
+        *_NO_FIELD_OF_VIEW,
+        *_NO_QUATERNION,
+        _QUALITY_NOT_TOLD,
+    )
+
+
+def clearance(state: AutopilotState, down: float) -> tuple[float, float]:
+    """Return the altitude of the ground, local, and how far it is below [m]; NaN = not known."""
+    ground = state.clearance
+    if ground is None or not ground.valid:
+        return math.nan, math.nan
+    return -down - ground.dist_bottom_m, ground.dist_bottom_m
+
+
+def _whole(value: float) -> int:
+    """Return what C makes of a number for a uint16 field: cut off, not rounded."""
+    return units.uint16(math.floor(value + 1e-9), unknown=0)
