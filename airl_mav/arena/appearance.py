@@ -66,6 +66,14 @@ class Statics:
 
 
 @dataclass(frozen=True)
+class Inside:
+    """What surfaces below a ceiling get of its light, in the mean."""
+
+    floor: Floats  # (3,) linear RGB irradiance of the floor
+    walls: Floats  # (3,) the same of upright surfaces
+
+
+@dataclass(frozen=True)
 class Light:
     """Sun, sky and fog. A white surface under the irradiance 1 reads full scale."""
 
@@ -75,6 +83,8 @@ class Light:
     horizon: Floats  # (3,) the same at the horizon; the colour of fog
     extinction: float
     """Of fog [1/m]."""
+    inside: Inside | None = None
+    """None: there is no ceiling. Else zenith and horizon are what it looks like, and no sun is."""
 
     @property
     def sky(self) -> Floats:

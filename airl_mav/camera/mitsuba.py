@@ -1,7 +1,8 @@
 """An arena and a camera as a scene of Mitsuba 3: path tracing, the reference of `colour`.
 
 Light goes as far as it does: shadows of the sky in corners, colour that one surface throws onto
-another. None of this is in the fast images. Fog and cylindrical cameras are not here.
+another. None of this is in the fast images, but for the means below a ceiling. Fog and cylindrical
+cameras are not here.
 """
 
 from __future__ import annotations
@@ -160,6 +161,10 @@ def _bodies(mi: Any, arena: Arena, centers: Floats) -> dict[str, Any]:
         made.append(_face(mi, finish, WALLS, at, half_e * y, half_h * z))
         at = np.array([north, east + side * half_e, -half_h])
         made.append(_face(mi, finish, WALLS, at, half_n * x, half_h * z))
+    if b.ceiling:
+        made.append(
+            _ceiling(mi, arena.look.light, np.array([north, east, -b.height]), half_n, half_e)
+        )
     for each in arena.meshes:
         made.append(_mesh(mi, finish, OBSTACLE + each.first, each))
     for i in range(len(o)):
@@ -196,6 +201,18 @@ def _face(
     start = (float(first[0] * per_m + begin[0]), float(first[1] * per_m + begin[1]))
     bsdf = _material(mi, finish, row, size, start)
     return {"type": "rectangle", "to_world": mi.ScalarTransform4f(pose), "bsdf": bsdf}
+
+
+def _ceiling(mi: Any, light: Light, center: Floats, half_n: float, half_e: float) -> dict[str, Any]:
+    """Return a ceiling that glows downwards, and reflects nothing."""
+    pose = np.diag([half_n, half_e, 1.0, 1.0])
+    pose[:3, 3] = center
+    return {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f(pose),
+        "bsdf": _diffuse(np.zeros(3)),
+        "emitter": {"type": "area", "radiance": {"type": "rgb", "value": light.zenith.tolist()}},
+    }
 
 
 def _ground(mi: Any, finish: Finish) -> dict[str, Any]:

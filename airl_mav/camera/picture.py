@@ -28,7 +28,7 @@ class Picture(NamedTuple):
 
     rgb: NDArray[np.uint8]  # (height, width, 3) sRGB
     depth_m: NDArray[np.float32]  # (height, width), 0 = no surface
-    seen: NDArray[np.int32]  # (height, width) SKY, FLOOR, ... of `raycast`, OBSTACLE + i
+    seen: NDArray[np.int32]  # (height, width) CEILING, SKY, ... of `primitives`, OBSTACLE + i
 
 
 @dataclass(frozen=True)
@@ -48,10 +48,12 @@ class ColourArrays:
         periods = np.array([PERIOD[name] for name in TEXTURES])
         floor = finish.albedo[FLOOR_ROW]
         share = means()[finish.texture[FLOOR_ROW]]
-        radiosity = (floor[0] + share * (floor[1] - floor[0])) * (
-            light.sky - light.to_sun[2] * light.sun
-        )
-        lights = [light.to_sun, light.sun, light.sky, radiosity, light.zenith, light.horizon]
+        sky = light.sky
+        radiosity = (floor[0] + share * (floor[1] - floor[0])) * (sky - light.to_sun[2] * light.sun)
+        if (inside := light.inside) is not None:
+            # An upright surface gets half of either.
+            sky, radiosity = inside.floor, np.maximum(2.0 * inside.walls - inside.floor, 0.0)
+        lights = [light.to_sun, light.sun, sky, radiosity, light.zenith, light.horizon]
         lights.append(np.array([light.extinction, 0.0, 0.0]))
         return cls(
             finish.texture,
