@@ -57,10 +57,10 @@ def main() -> None:
         times += flights.time_s[reached].tolist()
         ways += flights.distance_m[reached].tolist()
     n, goals = options.episodes, ended["success"]
-    low, high = wilson(goals, n)
+    share = wilson(goals, n).scaled(100.0)
     print(
-        f"{options.expert} in {options.arena}: {goals} of {n} goals, {100 * goals / n:.1f} "
-        f"[{100 * low:.1f}, {100 * high:.1f}] %, {np.mean(times):.2f} s, {np.mean(ways):.1f} m; "
+        f"{options.expert} in {options.arena}: {goals} of {n} goals, {share.value:.1f} "
+        f"[{share.low:.1f}, {share.high:.1f}] %, {np.mean(times):.2f} s, {np.mean(ways):.1f} m; "
         + ", ".join(f"{count} {name}" for name, count in sorted(ended.items()))
     )
 

@@ -70,7 +70,7 @@ class Work(NamedTuple):
             floats(n, m),
             np.zeros(n * m, np.int32),
             Rays(floats(n * m), floats(n * m), floats(n * m)),
-            Points(np.zeros(block, np.int32), floats(block), floats(block), floats(block)),
+            Points(np.zeros(block, np.int32), *(floats(block) for _ in range(5))),
             np.zeros((CORNERS, 3)),
         )
 

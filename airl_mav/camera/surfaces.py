@@ -255,7 +255,7 @@ def shade_obstacle(
     texel, radius = texels2(surface, pixel2), F32(half[0])
     per_m, begin_u, begin_v = surface.per_m, surface.offset[0], surface.offset[1]
     per_turn = F32(max(np.rint(_TURN * half[0] * per_m), 1.0))
-    place, facing, ups, _ = points
+    place, facing, ups = points.place, points.facing, points.up
     own = I32(OBSTACLE + number)
     for v in range(rectangle[0], rectangle[1]):
         line = v * len(xs)

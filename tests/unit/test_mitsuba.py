@@ -136,7 +136,7 @@ INDOORS = [
 
 
 @pytest.mark.parametrize(("seed", "position", "yaw"), INDOORS)
-def test_rooms_below_a_ceiling_are_within_four_percent(
+def test_rooms_below_a_ceiling_are_within_three_percent(
     seed: int, position: tuple[float, float, float], yaw: float
 ) -> None:
     """The same ceiling lights both; one of them follows its light from wall to wall."""
@@ -144,12 +144,12 @@ def test_rooms_below_a_ceiling_are_within_four_percent(
         load_profile("arenas", "rooms", ArenaSpec), seed, name="rooms", vehicle_width_m=0.55
     )
     inner, _ = difference(scene, position, yaw, rays=4)
-    assert inner < 0.04
-    # With what a level surface gets outdoors the walls would be far too bright: it can fail.
+    assert inner < 0.03
+    # As much light as the whole ceiling would give is too much: the means are worth something.
     look = scene.look
     assert look.light.inside is not None
     scene.__dict__["look"] = replace(look, light=replace(look.light, inside=None))
-    assert difference(scene, position, yaw, rays=4)[0] > 0.06
+    assert difference(scene, position, yaw, rays=4)[0] > 1.3 * inner
 
 
 @pytest.mark.parametrize("material", ["plaster", "brick"])
