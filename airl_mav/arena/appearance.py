@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from airl_mav.core.streams import Stream, stream
 from airl_mav.profiles.appearance import Appearance, Material, Surfaces, TextureName
+from airl_mav.profiles.image_file import ImageFile
 
 Floats = NDArray[np.float64]
 Rgb = tuple[int, int, int]
@@ -42,10 +43,12 @@ class _Part(IntEnum):
 class Finish:
     """The materials of m surfaces: floor, walls, then the obstacles in their order."""
 
-    texture: NDArray[np.int8]  # (m,) number in TEXTURES
+    texture: NDArray[np.int8]  # (m,) number in TEXTURES, or of an image: `image_number`
     albedo: Floats  # (m, 2, 3) linear RGB 0..1 where the texture is 0, and where it is 1
     size_m: Floats  # (m,) `Material.size_m`
     offset: Floats  # (m, 2) where the pattern begins, in its periods, 0..1
+    images: tuple[ImageFile, ...] = ()
+    """Pictures that surfaces may have."""
 
     def colour(self, row: int) -> Rgb:
         """Return the sRGB 0-255 of a surface seen from far away: half of each albedo."""
@@ -66,6 +69,14 @@ class Statics:
 
 
 @dataclass(frozen=True)
+class Inside:
+    """What surfaces below a ceiling get of its light, in the mean."""
+
+    floor: Floats  # (3,) linear RGB irradiance of the floor
+    walls: Floats  # (3,) the same of upright surfaces
+
+
+@dataclass(frozen=True)
 class Light:
     """Sun, sky and fog. A white surface under the irradiance 1 reads full scale."""
 
@@ -75,6 +86,8 @@ class Light:
     horizon: Floats  # (3,) the same at the horizon; the colour of fog
     extinction: float
     """Of fog [1/m]."""
+    inside: Inside | None = None
+    """None: there is no ceiling. Else zenith and horizon are what it looks like, and no sun is."""
 
     @property
     def sky(self) -> Floats:
@@ -132,7 +145,8 @@ def draw_appearance(
         if n
     ]
     texture, albedo, size, offset = (np.concatenate(parts) for parts in zip(*rows, strict=True))
-    return Drawn(Finish(texture.astype(np.int8), albedo, size, offset), _light(appearance, draw))
+    finish = Finish(texture.astype(np.int8), albedo, size, offset, appearance.images)
+    return Drawn(finish, _light(appearance, draw))
 
 
 def _surfaces(
@@ -162,13 +176,27 @@ def _surfaces(
         1.0 + kind.tint * (2.0 * draws[:, 2:5] - 1.0)
     )
     albedo = np.array([_albedos(material) for material in materials])[chosen] * factor[:, None]
-    texture = np.array([TEXTURES.index(material.texture) for material in materials], np.float64)
+    texture = np.array([_number(material, appearance) for material in materials], np.float64)
     size = np.array([material.size_m for material in materials])
     return texture[chosen], np.clip(albedo, 0.0, 1.0), size[chosen], draws[:, 5:]
 
 
+def image_number(k: int) -> int:
+    """Return the number of image k as a texture; its red, green and blue are three patterns."""
+    return len(TEXTURES) + 3 * k
+
+
+def _number(material: Material, appearance: Appearance) -> int:
+    """Return the number of a material's texture."""
+    if material.image is None:
+        return TEXTURES.index(material.texture)
+    return image_number(appearance.images.index(material.image))
+
+
 def _albedos(material: Material) -> Floats:
-    """Return both albedos (2, 3), linear RGB."""
+    """Return both albedos (2, 3), linear RGB; of an image those of its black and its white."""
+    if material.image is not None:
+        return np.stack([np.zeros(3), linear_of(np.array(material.albedo) / 255.0)])
     second = material.albedo if material.albedo_2 is None else material.albedo_2
     return linear_of(np.array([material.albedo, second]) / 255.0)
 

@@ -24,6 +24,10 @@ def arena_table(arena: Arena, spec: ArenaSpec) -> Table:
     table.add_column("value", justify="right")
     size = f"{b.north_max - b.north_min:g} x {b.east_max - b.east_min:g} x {b.height:g} m"
     table.add_row("floor north x east, walls", size)
+    if b.ceiling:
+        table.add_row("ceiling", f"{b.height:g} m high")
+    if (building := arena.building) is not None:
+        table.add_row("rooms", f"{building.rooms}, {building.doors} doors")
     table.add_row("start from the south-west corner", f"{-b.north_min:g} N {-b.east_min:g} E m")
     table.add_row("static obstacles", _shapes(arena, moving=False))
     table.add_row("moving obstacles", _shapes(arena, moving=True))

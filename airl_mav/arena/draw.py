@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.gates import over_openings
 from airl_mav.arena.geometry import Arena, Shape, Tour
+from airl_mav.arena.rooms import over_doors
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.files import replace_file
 
@@ -33,7 +34,7 @@ STATIC_COLOURS = ("#5b6670", "#2f363d")
 """Face and edge."""
 MOVING_COLOURS = ("#f0932b", "#9c5a0c")
 OPENING, OPENING_COLOUR = "opening", "#cfe3f5"
-"""What is below and above the opening of a gate: seen from above, the way leads through."""
+"""What is below and above the opening of a gate, or a door: from above, the way leads through."""
 START_COLOUR = "#1f4e8c"
 GOAL_COLOUR = "#1b8a3f"
 ZONE_COLOUR = "#8d8a83"
@@ -198,13 +199,13 @@ def _draw_obstacles(arena: Arena, ax: Axes, time_us: int) -> None:
     centers = arena.centers_at(time_us)
     labelled: set[bool | str] = set()
     open_way = np.zeros(len(arena.obstacles), np.bool_)
-    open_way[: arena.n_static] = over_openings(arena)
+    open_way[: arena.n_static] = over_openings(arena) | over_doors(arena)
     for i in range(len(arena.obstacles)):
         if open_way[i]:
             patch = _footprint(arena, i, centers[i])
             patch.set(facecolor=OPENING_COLOUR, edgecolor=STATIC_COLOURS[1], lw=0.6, zorder=1.9)
             if OPENING not in labelled:
-                patch.set_label("opening of a gate")
+                patch.set_label("door" if arena.building is not None else "opening of a gate")
                 labelled.add(OPENING)
             ax.add_patch(patch)
             continue

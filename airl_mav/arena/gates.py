@@ -88,7 +88,7 @@ def frames(openings: Openings, bounds: Bounds) -> Obstacles:
 
 
 def with_gates(statics: Statics | None, standing: Obstacles, k: int) -> Statics | None:
-    """Return what the primitives are parts of, once k gates stand behind the others.
+    """Return what the primitives that stand belong to, with the boxes of k gates behind them.
 
     Args:
         statics: Of the others; None: each is a thing of its own.
@@ -97,14 +97,25 @@ def with_gates(statics: Statics | None, standing: Obstacles, k: int) -> Statics 
     """
     if k == 0:
         return statics
+    gates = Statics((GATE,) * k, np.repeat(np.arange(k), PARTS), (None,) * (PARTS * k))
+    return with_walls(statics, standing, gates)
+
+
+def with_walls(statics: Statics | None, standing: Obstacles, walls: Statics) -> Statics:
+    """Return what the primitives that stand belong to, with those of walls behind them.
+
+    Args:
+        statics: Of the others; None: each is a thing of its own.
+        standing: The others.
+        walls: What the boxes of walls belong to.
+    """
     if statics is None:
         names = tuple(Shape(int(shape)).name.lower() for shape in standing.shape)
         statics = Statics(names, np.arange(len(names)), (None,) * len(names))
-    things = len(statics.names)
     return Statics(
-        names=statics.names + (GATE,) * k,
-        of=np.concatenate([statics.of, things + np.repeat(np.arange(k), PARTS)]),
-        materials=statics.materials + (None,) * (PARTS * k),
+        names=statics.names + walls.names,
+        of=np.concatenate([statics.of, len(statics.names) + walls.of]),
+        materials=statics.materials + walls.materials,
     )
 
 

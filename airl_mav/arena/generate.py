@@ -19,11 +19,13 @@ from airl_mav.arena.gates import (
     draw_openings,
     frames,
     with_gates,
+    with_walls,
 )
-from airl_mav.arena.geometry import Arena, Bounds, Obstacles, PlacedMesh, Tour
+from airl_mav.arena.geometry import Arena, Bounds, Building, Obstacles, PlacedMesh, Tour
 from airl_mav.arena.own import generate_own
-from airl_mav.arena.passage import free_share, passage_exists
+from airl_mav.arena.passage import free_share, least_gap_m, passage_exists
 from airl_mav.arena.placement import TRIES, NoRoomError, place_all
+from airl_mav.arena.rooms import Plan, draw_plan, room_walls, standing_on_the_floor
 from airl_mav.arena.tours import draw_tours
 from airl_mav.arena.zones import draw_goal, zone_radius_m
 from airl_mav.core.errors import UsageError
@@ -46,6 +48,7 @@ class _Stream(IntEnum):
     MOVING = 3
     GATES = 4
     HEIGHT = 5
+    ROOMS = 6
 
 
 @dataclass(frozen=True)
@@ -59,11 +62,28 @@ class _Request:
     vehicle_width_m: float
     openings: Openings
     """Of the gates."""
+    plan: Plan | None
+    """Of the rooms."""
 
     @cached_property
-    def frames(self) -> Obstacles:
-        """The boxes of the gates."""
-        return frames(self.openings, self.bounds)
+    def walls(self) -> Obstacles:
+        """The boxes of the gates, or of the walls between rooms."""
+        if self.plan is None:
+            return frames(self.openings, self.bounds)
+        return room_walls(self.plan, self.bounds)[0]
+
+    def with_walls(self, statics: Statics | None, standing: Obstacles) -> Statics | None:
+        """Return what primitives that stand belong to, with the boxes of walls behind them."""
+        if self.plan is None:
+            return with_gates(statics, standing, len(self.openings))
+        return with_walls(statics, standing, room_walls(self.plan, self.bounds)[1])
+
+    @property
+    def building(self) -> Building | None:
+        """What the arena says of its rooms."""
+        if self.plan is None:
+            return None
+        return Building(len(self.plan.rooms), len(self.plan.doors), len(self.walls))
 
     @cached_property
     def start_box(self) -> Boxes:
@@ -96,10 +116,12 @@ def generate(
         return generate_own(spec, seed, name=name, vehicle_width_m=vehicle_width_m, zone=zone)
     openings = draw_openings(_rng(seed, _Stream.GATES), spec)
     _check_openings(openings, name, seed, vehicle_width_m)
+    bounds = local_bounds(spec)
     request = _Request(
         openings=openings,
+        plan=_draw_rooms(spec, seed, bounds, name, vehicle_width_m),
         spec=spec,
-        bounds=local_bounds(spec),
+        bounds=bounds,
         counts=_draw_counts(spec, seed),
         ring_m=(spec.goal.min_distance_m, zone_radius_m(spec, zone)),
         vehicle_width_m=vehicle_width_m,
@@ -122,14 +144,15 @@ def generate(
             seed=seed,
             bounds=request.bounds,
             wall_colour=spec.wall_colour,
-            obstacles=_concatenate(_concatenate(static, request.frames), moving),
+            obstacles=_concatenate(_concatenate(static, request.walls), moving),
             tours=tours,
             goal=goal,
             appearance=spec.appearance,
             meshes=meshes,
-            statics=with_gates(statics, static, len(openings)),
+            statics=request.with_walls(statics, static),
             goal_height_m=_draw_height(seed, spec),
             n_gates=len(openings),
+            building=request.building,
         )
     raise UsageError(f"arena {name!r}, seed {seed}: {failure} (best of {LAYOUTS} layouts)")
 
@@ -142,6 +165,7 @@ def local_bounds(spec: ArenaSpec) -> Bounds:
         east_min=-spec.start.east_m,
         east_max=spec.size.east_m - spec.start.east_m,
         height=spec.size.height_m,
+        ceiling=spec.size.ceiling,
     )
 
 
@@ -179,6 +203,25 @@ def _check_fixed_goal(request: _Request, zone: int | None) -> None:
         )
 
 
+def _draw_rooms(
+    spec: ArenaSpec, seed: int, bounds: Bounds, name: str, vehicle_width_m: float
+) -> Plan | None:
+    """Draw the rooms; None: there are none. Raises UsageError where they cannot be flown in."""
+    if not spec.rooms.drawn:
+        return None
+    least = least_gap_m(bounds, vehicle_width_m)
+    if spec.rooms.door_width_m[0] < least:
+        raise UsageError(
+            f"arena {name!r}: rooms.door_width_m = {list(spec.rooms.door_width_m)}: accepted: value"
+            f" >= {least:.2f} m, so that a vehicle {vehicle_width_m:g} m wide finds its way through"
+        )
+    keep_off = _around(np.zeros(2), spec.start.clearance_m)
+    if spec.goal.fixed is not None:
+        goal = _around(np.array(spec.goal.fixed), spec.goal.clearance_m)
+        keep_off = join(keep_off, goal)
+    return draw_plan(_rng(seed, _Stream.ROOMS), spec, bounds, keep_off, name)
+
+
 def _check_openings(openings: Openings, name: str, seed: int, vehicle_width_m: float) -> None:
     """Refuse an opening that the vehicle does not fit through, whatever way it leans."""
     if not len(openings):
@@ -214,8 +257,10 @@ def _draw_static(
     keep_off = request.start_box
     if spec.goal.fixed is not None:
         keep_off = join(keep_off, _around(np.array(spec.goal.fixed), spec.goal.clearance_m))
-    if len(request.frames):
-        keep_off = join(keep_off, bounding_boxes(request.frames).grown(spec.min_clearance_m))
+    if len(request.walls):
+        keep_off = join(keep_off, bounding_boxes(request.walls).grown(spec.min_clearance_m))
+    if request.plan is not None:
+        keep_off = join(keep_off, request.plan.grown_passages(spec.rooms.door_clearance_m))
     try:
         places = place_all(
             rng, bodies.bounding_half, keep_off, request.bounds, spec.min_clearance_m
@@ -241,10 +286,14 @@ def _draw_reachable_goal(
     spec, progress = request.spec, len(static)
     keep_off = standing.grown(spec.goal.clearance_m)
     boxes: Boxes | None = standing
-    if len(request.frames):
-        clearance_m = spec.goal.clearance_m
+    clearance_m = spec.goal.clearance_m
+    if len(request.openings):
         keep_off = join(keep_off, behind(request.openings, request.bounds, clearance_m))
-        static, boxes = _concatenate(static, closed_from_above(request.frames)), None
+        static, boxes = _concatenate(static, closed_from_above(request.walls)), None
+    elif request.plan is not None:
+        around = join(bounding_boxes(request.walls), request.plan.passages())
+        keep_off = join(keep_off, around.grown(clearance_m))
+        static, boxes = _concatenate(static, standing_on_the_floor(request.walls)), None
     for _ in range(GOALS_PER_LAYOUT):
         goal = (
             draw_goal(rng, request.bounds, keep_off, request.ring_m, spec.goal.clearance_m)
@@ -280,12 +329,15 @@ def _draw_moving(
     spec, (_, n) = request.spec, request.counts
     bodies = draw_bodies(rng, n, spec.moving, spec.flight_altitude_m)
     gap, walking_gap = spec.min_clearance_m, spec.moving.clearance_m
-    if len(request.frames):
-        standing = join(standing, bounding_boxes(request.frames))
-    on_the_way = join(request.start_box, standing.grown(walking_gap))
+    if len(request.walls):
+        standing = join(standing, bounding_boxes(request.walls))
+    always = request.start_box
+    if request.plan is not None:  # They stay in their rooms.
+        always = join(always, request.plan.grown_passages(spec.rooms.door_clearance_m))
+    on_the_way = join(always, standing.grown(walking_gap))
     at_first = on_the_way
     if gap > walking_gap:
-        at_first = join(request.start_box, standing.grown(gap))
+        at_first = join(always, standing.grown(gap))
     tours = draw_tours(
         rng,
         bodies.bounding_half,

@@ -6,14 +6,15 @@ are negative z. The four walls stand on the edges of `bounds`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from enum import IntEnum
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.appearance import Drawn, Statics, draw_appearance
+from airl_mav.arena.appearance import OBSTACLE, WALLS, Drawn, Statics, draw_appearance
+from airl_mav.arena.indoors import indoors
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.goals import Goal
 from airl_mav.profiles.appearance import DEFAULT, Appearance
@@ -38,12 +39,12 @@ class Bounds:
     east_max: float
     height: float
     """Wall height above the floor [m], positive."""
+    ceiling: bool = False
+    """Whether there is one, at that height."""
 
     def as_array(self) -> NDArray[np.float64]:
-        """Return [north_min, north_max, east_min, east_max, height] for the kernels."""
-        return np.array(
-            [self.north_min, self.north_max, self.east_min, self.east_max, self.height], np.float64
-        )
+        """Return (6,) all fields in their order for the kernels; 1: there is a ceiling, 0: none."""
+        return np.array([*astuple(self)], np.float64)
 
 
 @dataclass(frozen=True)
@@ -88,6 +89,17 @@ class Tour:
 
 
 @dataclass(frozen=True)
+class Building:
+    """What there is of rooms in an arena (`arena.rooms`)."""
+
+    rooms: int
+    """Of which one may be a corridor."""
+    doors: int
+    boxes: int
+    """So many boxes of walls between rooms are the last of those obstacles that stand."""
+
+
+@dataclass(frozen=True)
 class Arena:
     """One concrete arena. The same object makes bodies, depth images, episodes and pictures."""
 
@@ -110,6 +122,8 @@ class Arena:
     """Of the goal, above the floor; None: it has none, and is reached at any height."""
     n_gates: int = 0
     """The boxes of so many gates are the last of those obstacles that stand (`arena.gates`)."""
+    building: Building | None = None
+    """Of its rooms; None: it is not divided into any."""
 
     @property
     def goal_point(self) -> Goal:
@@ -120,7 +134,7 @@ class Arena:
     @cached_property
     def look(self) -> Drawn:
         """Materials of all surfaces, and the light; drawn when it is first asked for."""
-        return draw_appearance(
+        look = draw_appearance(
             self.appearance,
             self.seed,
             self.n_static,
@@ -128,6 +142,19 @@ class Arena:
             self.wall_colour,
             self.statics,
         )
+        return self._indoors(look) if self.bounds.ceiling else look
+
+    def _indoors(self, look: Drawn) -> Drawn:
+        """Return a look with the light that there is below the ceiling."""
+        b, n = self.bounds, self.n_static
+        length, width = b.north_max - b.north_min, b.east_max - b.east_min
+        walls = [(WALLS, 2.0 * (length + width) * b.height)]
+        boxes = 0 if self.building is None else self.building.boxes
+        for i in range(n - boxes, n):
+            # Both sides of it are seen.
+            half = self.obstacles.half_size[i]
+            walls.append((OBSTACLE + i, float(8.0 * half[:2].max() * half[2])))
+        return indoors(look, length * width, tuple(walls))
 
     def mesh_of(self, i: int) -> PlacedMesh | None:
         """Return the mesh that cameras see in place of obstacle i; None: they see the obstacle."""

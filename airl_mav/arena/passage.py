@@ -74,14 +74,24 @@ def _gaps_suffice(
     return True
 
 
+def least_gap_m(bounds: Bounds, width_m: float) -> float:
+    """Return how wide a gap along north or east must be for `raster_passage` to find it [m]."""
+    return width_m + (1.0 + math.sqrt(2.0)) * _cell_m(bounds)
+
+
+def _cell_m(bounds: Bounds) -> float:
+    """Return the pitch of the raster of a floor [m]."""
+    area = (bounds.north_max - bounds.north_min) * (bounds.east_max - bounds.east_min)
+    return max(CELL_M, math.sqrt(area / CELLS_MAX))
+
+
 def raster_passage(bounds: Bounds, obstacles: Obstacles, goal: Floats, width_m: float) -> bool:
     """Return whether free cells join the start's cell to the goal's, stepping along the axes.
 
     A cell is free when its centre keeps half the width plus half a cell diagonal from everything:
     no point of a step between two free cells, or of the last bit to the goal, is then too near.
     """
-    area = (bounds.north_max - bounds.north_min) * (bounds.east_max - bounds.east_min)
-    cell = max(CELL_M, math.sqrt(area / CELLS_MAX))
+    cell = _cell_m(bounds)
     margin = width_m / 2.0 + cell / math.sqrt(2.0)
     # The origin is a cell's centre.
     south, west = math.floor(bounds.north_min / cell), math.floor(bounds.east_min / cell)

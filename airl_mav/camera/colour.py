@@ -70,7 +70,7 @@ class Work(NamedTuple):
             floats(n, m),
             np.zeros(n * m, np.int32),
             Rays(floats(n * m), floats(n * m), floats(n * m)),
-            Points(np.zeros(block, np.int32), floats(block), floats(block), floats(block)),
+            Points(np.zeros(block, np.int32), *(floats(block) for _ in range(5))),
             np.zeros((CORNERS, 3)),
         )
 
@@ -106,8 +106,8 @@ def render_colour(
         rgb: (height, width, 3) sRGB, written; black from inside an obstacle.
         depth: (height, width) depth [m] as `render_depth` defines it, without a limit of range,
             written; 0: no surface.
-        seen: (height, width) what each pixel sees, written: SKY, FLOOR, ... of `primitives`, for an
-            obstacle OBSTACLE + its number, for a mesh that of the first obstacle it owns.
+        seen: (height, width) what each pixel sees, written: CEILING, SKY, ... of `primitives`, for
+            an obstacle OBSTACLE + its number, for a mesh that of the first obstacle it owns.
         work: For this size of image.
         position: As of `render_depth`, with the rest up to `meshes`.
         quaternion: (4,).
@@ -115,7 +115,7 @@ def render_colour(
         cx: Column of the optical axis.
         cy: Row of the optical axis.
         cylindrical: The image is a cylinder's.
-        bounds: (5,).
+        bounds: (6,).
         shape: (n,).
         center: (n, 3).
         half_size: (n, 3).

@@ -1,7 +1,8 @@
 """An arena and a camera as a scene of Mitsuba 3: path tracing, the reference of `colour`.
 
 Light goes as far as it does: shadows of the sky in corners, colour that one surface throws onto
-another. None of this is in the fast images. Fog and cylindrical cameras are not here.
+another. None of this is in the fast images, but for the means below a ceiling. Fog and cylindrical
+cameras are not here.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from airl_mav.arena.geometry import Arena, PlacedMesh, Shape
 from airl_mav.arena.triangles import standing, triangles_of
 from airl_mav.camera.colour import RANGE_M
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.textures import PERIOD, means, pattern
+from airl_mav.camera.textures import mean_of, periods, texels
 from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import quat_to_matrix
 
@@ -160,6 +161,10 @@ def _bodies(mi: Any, arena: Arena, centers: Floats) -> dict[str, Any]:
         made.append(_face(mi, finish, WALLS, at, half_e * y, half_h * z))
         at = np.array([north, east + side * half_e, -half_h])
         made.append(_face(mi, finish, WALLS, at, half_n * x, half_h * z))
+    if b.ceiling:
+        made.append(
+            _ceiling(mi, arena.look.light, np.array([north, east, -b.height]), half_n, half_e)
+        )
     for each in arena.meshes:
         made.append(_mesh(mi, finish, OBSTACLE + each.first, each))
     for i in range(len(o)):
@@ -198,10 +203,22 @@ def _face(
     return {"type": "rectangle", "to_world": mi.ScalarTransform4f(pose), "bsdf": bsdf}
 
 
+def _ceiling(mi: Any, light: Light, center: Floats, half_n: float, half_e: float) -> dict[str, Any]:
+    """Return a ceiling that glows downwards, and reflects nothing."""
+    pose = np.diag([half_n, half_e, 1.0, 1.0])
+    pose[:3, 3] = center
+    return {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f(pose),
+        "bsdf": _diffuse(np.zeros(3)),
+        "emitter": {"type": "area", "radiance": {"type": "rgb", "value": light.zenith.tolist()}},
+    }
+
+
 def _ground(mi: Any, finish: Finish) -> dict[str, Any]:
     """Return the ground beyond the walls, of the floor's mean albedo, just below it."""
     dark, bright = finish.albedo[FLOOR]
-    mean = dark + means()[finish.texture[FLOOR]] * (bright - dark)
+    mean = dark + mean_of(finish, FLOOR) * (bright - dark)
     pose = np.diag([RANGE_M, RANGE_M, 1.0, 1.0])
     pose[2, 3] = 0.01
     return {"type": "disk", "to_world": mi.ScalarTransform4f(pose), "bsdf": _diffuse(mean)}
@@ -237,7 +254,7 @@ def _cylinder(
     ends = [(center + np.array([0.0, 0.0, side * height])).tolist() for side in (-1.0, 1.0)]
     side = {"type": "cylinder", "p0": ends[0], "p1": ends[1], "radius": radius, "bsdf": bsdf}
     dark, bright = finish.albedo[row]
-    mean = _diffuse(dark + means()[finish.texture[row]] * (bright - dark))
+    mean = _diffuse(dark + mean_of(finish, row) * (bright - dark))
     caps = []
     for end in ends:
         pose = np.diag([radius, radius, 1.0, 1.0])
@@ -279,7 +296,7 @@ def _mesh(mi: Any, finish: Finish, row: int, placed: PlacedMesh) -> Any:
 
 def _per_m(finish: Finish, row: int) -> float:
     """Return the periods of a pattern for a metre."""
-    return 1.0 / (float(finish.size_m[row]) * PERIOD[TEXTURES[finish.texture[row]]])
+    return 1.0 / float((finish.size_m * periods(finish))[row])
 
 
 def _around(finish: Finish, row: int, radius: float) -> float:
@@ -300,16 +317,15 @@ def _material(
     start: tuple[float, float],
 ) -> dict[str, Any]:
     """Return a material whose pattern begins at `start` and goes on for `size`, in periods."""
-    name = TEXTURES[finish.texture[row]]
     dark, bright = finish.albedo[row]
-    if name == "plain":
+    if TEXTURES.index("plain") == finish.texture[row]:
         return _diffuse(dark)
-    texels = (dark + pattern(name)[..., None] * (bright - dark)).astype(np.float32)
+    mixed = (dark + texels(finish, row) * (bright - dark)).astype(np.float32)
     place = np.eye(4)
     place[0, 0], place[1, 1], place[0, 3], place[1, 3] = *size, *start
     texture = {
         "type": "bitmap",
-        "bitmap": mi.Bitmap(texels),
+        "bitmap": mi.Bitmap(mixed),
         "raw": True,
         "filter_type": "nearest",
         "to_uv": mi.ScalarTransform4f(place),

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.arena.appearance import FLOOR as FLOOR_ROW
-from airl_mav.arena.appearance import TEXTURES, Drawn, linear_of, srgb_of
+from airl_mav.arena.appearance import Drawn, linear_of, srgb_of
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.bvh import meshes_of
 from airl_mav.camera.colour import Work, render_colour
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.textures import PERIOD, atlas, means
+from airl_mav.camera.textures import atlas, mean_of, periods
 from airl_mav.core.kernels import kernel
 from airl_mav.vehicle.rotation import Quat, Vec
 
@@ -28,7 +28,7 @@ class Picture(NamedTuple):
 
     rgb: NDArray[np.uint8]  # (height, width, 3) sRGB
     depth_m: NDArray[np.float32]  # (height, width), 0 = no surface
-    seen: NDArray[np.int32]  # (height, width) SKY, FLOOR, ... of `raycast`, OBSTACLE + i
+    seen: NDArray[np.int32]  # (height, width) CEILING, SKY, ... of `primitives`, OBSTACLE + i
 
 
 @dataclass(frozen=True)
@@ -45,17 +45,18 @@ class ColourArrays:
     def of(cls, look: Drawn) -> ColourArrays:
         """Return the arrays of a drawn appearance."""
         finish, light = look.finish, look.light
-        periods = np.array([PERIOD[name] for name in TEXTURES])
         floor = finish.albedo[FLOOR_ROW]
-        share = means()[finish.texture[FLOOR_ROW]]
-        radiosity = (floor[0] + share * (floor[1] - floor[0])) * (
-            light.sky - light.to_sun[2] * light.sun
-        )
-        lights = [light.to_sun, light.sun, light.sky, radiosity, light.zenith, light.horizon]
+        share = mean_of(finish, FLOOR_ROW)
+        sky = light.sky
+        radiosity = (floor[0] + share * (floor[1] - floor[0])) * (sky - light.to_sun[2] * light.sun)
+        if (inside := light.inside) is not None:
+            # An upright surface gets half of either.
+            sky, radiosity = inside.floor, np.maximum(2.0 * inside.walls - inside.floor, 0.0)
+        lights = [light.to_sun, light.sun, sky, radiosity, light.zenith, light.horizon]
         lights.append(np.array([light.extinction, 0.0, 0.0]))
         return cls(
             finish.texture,
-            (1.0 / (finish.size_m * periods[finish.texture])).astype(np.float32),
+            (1.0 / (finish.size_m * periods(finish))).astype(np.float32),
             finish.offset.astype(np.float32),
             finish.albedo.astype(np.float32),
             np.array(lights, np.float32),
@@ -104,7 +105,7 @@ def render_picture(
         look.offset,
         look.albedo,
         look.lights,
-        atlas(),
+        atlas(arena.look.finish.images),
     )
     return picture
 

@@ -19,6 +19,7 @@ from airl_mav.vehicle.rotation import Vec
 BOX: Final = int(Shape.BOX)
 CYLINDER: Final = int(Shape.CYLINDER)
 
+CEILING: Final = -1
 SKY: Final = 0
 FLOOR: Final = 1
 WALL_NORTH_SOUTH: Final = 2
@@ -80,11 +81,13 @@ def draw_room(
     view: View,
     pose: Pose,
     half: Vec,
+    closed: bool,
 ) -> None:
-    """Write the inverse depth of floor and walls; 0 = no return. And what is seen, in `ids`.
+    """Write inverse depth of floor, walls and ceiling, 0 = no return, and in `ids` what is seen.
 
-    The room is a box without a lid. A ray that leaves it by the lid sees nothing, one that enters
-    by the lid sees the inside, any other that enters sees a wall from outside.
+    Without a ceiling the room is a box without a lid: a ray that leaves it by the lid sees nothing,
+    one that enters by the lid sees the inside, any other that enters sees a wall from outside.
+    Where it is closed, either sees the lid.
     """
     c, r = pose.center, pose.along
     north = _slab(c[0] - half[0], c[0] + half[0])
@@ -93,6 +96,7 @@ def draw_room(
     above = top > 0.0
     lid = 1.0 / (max(top, TINY) if above else min(top, -TINY))
     enter_gain, enter_base, exit_gain = (lid, 0.0, 0.0) if above else (0.0, _UNLIMITED, lid)
+    covered, lid_seen = closed and above, 1.0 if closed else 0.0
     for v in range(out.shape[0]):
         d0, d1, d2 = _line_start(pose, lines[v, 0], lines[v, 1])
         row = out[v]
@@ -110,7 +114,8 @@ def draw_room(
                 max(max(east.exit_a * e, east.exit_b * e), floor * d),
             )
             leave_lid = exit_gain * d
-            inner = leave if leave >= leave_lid else 0.0
+            inner = leave if leave >= leave_lid else lid_seen * leave_lid
+            inner = by_lid if covered else inner
             s = by_side if by_side < by_lid else inner
             enters = min(by_side, by_lid) >= max(leave, leave_lid)
             s = s if enters else 0.0
@@ -124,6 +129,7 @@ def draw_room(
                 east_in = east.enter_gain * e + east.enter_base
                 wall_out = WALL_NORTH_SOUTH if norths >= easts else WALL_EAST_WEST
                 inner_id = FLOOR if floor * d >= max(norths, easts) else wall_out
+                inner_id = CEILING if covered or leave < leave_lid else inner_id
                 outer_id = WALL_NORTH_SOUTH if north_in <= east_in else WALL_EAST_WEST
                 found = outer_id if inwards else inner_id
                 marks[u] = found if s > 0.0 else SKY

@@ -188,7 +188,7 @@ def draw_bodies(
 
     Args:
         out: (n, m) inverse depth [1/m], written.
-        ids: (n, m) written: what each pixel sees, SKY, FLOOR, ... or OBSTACLE + its number; None:
+        ids: (n, m) written: what each pixel sees, CEILING, SKY, ... or OBSTACLE + its number; None:
             nobody asks, and nothing is spent on it.
         drawn_in: (obstacles, 3, 4) written: the rectangles that each obstacle was drawn in; None:
             nobody asks.
@@ -215,7 +215,8 @@ def draw_bodies(
     )
     half_room = (0.5 * (bounds[1] - bounds[0]), 0.5 * (bounds[3] - bounds[2]), 0.5 * bounds[4])
     forward, across, along = axes.forward, axes.across, axes.along
-    draw_room(out, ids, lines, xs, view, Pose(forward, across, along, room), half_room)
+    closed = bounds[5] > 0.0
+    draw_room(out, ids, lines, xs, view, Pose(forward, across, along, room), half_room, closed)
     for i in range(len(shape)):
         if is_owned(meshes, i):
             continue
@@ -251,10 +252,11 @@ def render_depth(
     """Render the depth image of an arena.
 
     The floor is the rectangle of the bounds at z = 0. The walls are thin, stand on its edges and
-    are seen from both sides; a ray that passes over them has no return. A camera less than
-    `MIN_DEPTH_M` above the floor is lifted to that height (a resting vehicle sinks in by the
-    contact's penetration). From inside an obstacle every pixel reads `MIN_DEPTH_M`. In place of the
-    obstacles that a mesh owns its triangles are seen, from inside as well.
+    are seen from both sides; a ray that passes over them has no return, unless there is a ceiling
+    at their height. A camera less than `MIN_DEPTH_M` above the floor is lifted to that height (a
+    resting vehicle sinks in by the contact's penetration). From inside an obstacle every pixel
+    reads `MIN_DEPTH_M`. In place of the obstacles that a mesh owns its triangles are seen, from
+    inside as well.
 
     Args:
         out: (height, width) depth [m], written; 0 = no return. Along the optical axis of a pinhole,
@@ -267,7 +269,7 @@ def render_depth(
         cy: Row of the optical axis.
         cylindrical: The image is a cylinder's, as `Intrinsics` defines it.
         max_range: Greatest depth that gives a return [m].
-        bounds: (5,) `Bounds.as_array()`.
+        bounds: (6,) `Bounds.as_array()`.
         shape: (n,) `Shape`.
         center: (n, 3) NED [m].
         half_size: (n, 3) as in `Obstacles` [m].

@@ -11,6 +11,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.arena.appearance import TEXTURES
 from airl_mav.camera.textures import LEVELS, STRIDE
 from airl_mav.core.kernels import kernel
 
@@ -23,6 +24,9 @@ Packed = NDArray[np.int32]
 ZERO: Final = F32(0.0)
 HALF: Final = F32(0.5)
 ONE: Final = F32(1.0)
+_IMAGES: Final = len(TEXTURES)
+"""The first number of a texture that is an image's."""
+
 LEAST: Final = F32(1e-6)
 """Least size of a divisor."""
 
@@ -32,6 +36,8 @@ class Surface(NamedTuple):
 
     base: np.int64
     """Where its pattern begins in the atlas."""
+    step: np.int64
+    """From there to that of green, and from that to blue's; 0: they are one."""
     per_m: np.float32
     """Periods of the pattern for a metre [1/m]."""
     offset: tuple[np.float32, np.float32]
@@ -52,7 +58,10 @@ class Points(NamedTuple):
     up: Plane
     """Cosine of the angle between normal and zenith."""
     pattern: Plane
-    """What the texture is there."""
+    """What the texture is there; of an image its red."""
+    green: Plane
+    """Of an image, with the next one."""
+    blue: Plane
 
 
 class Rays(NamedTuple):
@@ -95,7 +104,8 @@ def surface_of(
         albedo[i, 1, 2] - dark[2],
     )
     base = np.int64(texture[i]) * STRIDE
-    return Surface(base, per_m[i], (offset[i, 0], offset[i, 1]), dark, more)
+    step = np.int64(STRIDE) if texture[i] >= _IMAGES else np.int64(0)
+    return Surface(base, step, per_m[i], (offset[i, 0], offset[i, 1]), dark, more)
 
 
 @kernel
@@ -159,12 +169,18 @@ def paint(
         light: The light.
         atlas: `textures.atlas()`.
     """
-    place, facing, up, pattern = points
+    place, facing, up, pattern, green_of, blue_of = points
     row, marks = out[left:end], seen[left:end]
     lit_row, clear_row = lit[left:end], clear[left:end]
     # By itself: a loop that reads from all over the atlas does not vectorise.
     for u in range(end - left):
         pattern[u] = atlas[surface.base + place[u]]
+    if surface.step == 0:
+        green_of, blue_of = pattern, pattern
+    else:
+        green_at, blue_at = surface.base + surface.step, surface.base + 2 * surface.step
+        for u in range(end - left):
+            green_of[u], blue_of[u] = atlas[green_at + place[u]], atlas[blue_at + place[u]]
     dark, more, sun, horizon = surface.albedo, surface.more, light.sun, light.horizon
     # Of sky and ground: what an upright plane gets of both, and how much more a level one.
     upright = (
@@ -177,8 +193,10 @@ def paint(
         value, through = pattern[u], clear_row[u]
         direct, rise = lit_row[u] * facing[u], up[u]
         red = (dark[0] + more[0] * value) * (direct * sun[0] + (upright[0] + rise * level[0]))
-        green = (dark[1] + more[1] * value) * (direct * sun[1] + (upright[1] + rise * level[1]))
-        blue = (dark[2] + more[2] * value) * (direct * sun[2] + (upright[2] + rise * level[2]))
+        green = (dark[1] + more[1] * green_of[u]) * (
+            direct * sun[1] + (upright[1] + rise * level[1])
+        )
+        blue = (dark[2] + more[2] * blue_of[u]) * (direct * sun[2] + (upright[2] + rise * level[2]))
         colour = packed(
             horizon[0] + through * (red - horizon[0]),
             horizon[1] + through * (green - horizon[1]),

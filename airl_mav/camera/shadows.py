@@ -68,7 +68,7 @@ def shade_by_walls(
         far: (n,) depth [m]; 0: no surface.
         rays: Of the pixels.
         camera: (3,) NED [m].
-        bounds: (5,) of the arena.
+        bounds: (6,) of the arena.
         to_sun: (3,) unit vector NED.
         extinction: Of fog [1/m].
     """

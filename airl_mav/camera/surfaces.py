@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from airl_mav.camera.primitives import (
     BOX,
+    CEILING,
     CYLINDER,
     FLOOR,
     OBSTACLE,
@@ -101,12 +102,13 @@ def write_rays(rays: Rays, lines: Lines, xs: Line, axes: Pose) -> None:
 def draw_sky(out: Packed, ids: Ids, points: Points, rays: Rays, camera: Vec, light: Lit) -> None:
     """Write what is seen where there is no surface: sky, and below the horizon level ground.
 
-    The ground beyond the walls is as bright as the floor is in the mean.
+    The ground beyond the walls is as bright as the floor is in the mean. A ceiling takes the place
+    of the sky, and looks like it from everywhere.
     """
     above = F32(max(-camera[2], MIN_DEPTH_M))
     zenith, horizon, ground = light.zenith, light.horizon, light.ground
     rises, clear = points.up, points.pattern
-    begin, stop = span_of(ids, 0, len(ids), 0, len(ids), I32(SKY), I32(SKY))
+    begin, stop = span_of(ids, 0, len(ids), 0, len(ids), I32(CEILING), I32(SKY))
     for left in range(begin, stop, BLOCK):
         end = min(left + BLOCK, stop)
         row, norths, easts, downs = (
@@ -253,7 +255,7 @@ def shade_obstacle(
     texel, radius = texels2(surface, pixel2), F32(half[0])
     per_m, begin_u, begin_v = surface.per_m, surface.offset[0], surface.offset[1]
     per_turn = F32(max(np.rint(_TURN * half[0] * per_m), 1.0))
-    place, facing, ups, _ = points
+    place, facing, ups = points.place, points.facing, points.up
     own = I32(OBSTACLE + number)
     for v in range(rectangle[0], rectangle[1]):
         line = v * len(xs)

@@ -1,18 +1,21 @@
-"""Procedural textures: patterns of numbers 0..1 that repeat, with their coarser levels (mip maps).
+"""Textures: patterns of numbers 0..1 that repeat, with their coarser levels (mip maps).
 
-A pattern is a function of nothing but its name. What differs from surface to surface is where it
-begins, how large it is and between which albedos it mixes.
+A procedural pattern is a function of nothing but its name; a picture from a file is three patterns.
+What differs from surface to surface is where it begins, how large it is and between which albedos
+it mixes.
 """
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, lru_cache
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.appearance import TEXTURES
+from airl_mav.arena.appearance import TEXTURES, Finish, image_number
+from airl_mav.camera.image_textures import texels_of
+from airl_mav.profiles.image_file import ImageFile
 
 Floats = NDArray[np.float64]
 
@@ -35,12 +38,18 @@ _JOINT: Final = 2  # texels of mortar above a brick, and on its left
 _OCTAVES: Final = 3
 
 
-@cache
-def atlas() -> NDArray[np.float32]:
-    """Return all levels of all patterns (patterns * STRIDE,), in the order of TEXTURES."""
-    made = np.zeros(len(TEXTURES) * STRIDE, np.float32)
-    for number, name in enumerate(TEXTURES):
-        level, n = pattern(name), SIDE
+@lru_cache(maxsize=8)
+def atlas(images: tuple[ImageFile, ...] = ()) -> NDArray[np.float32]:
+    """Return all levels of all patterns (patterns * STRIDE,), in the order of TEXTURES.
+
+    Behind them those of images: red, green and blue of each. Raises UsageError for one that cannot
+    be read.
+    """
+    planes = [np.moveaxis(texels_of(image, SIDE), -1, 0) for image in images]
+    patterns = [*map(pattern, TEXTURES), *(plane for image in planes for plane in image)]
+    made = np.zeros(len(patterns) * STRIDE, np.float32)
+    for number, finest in enumerate(patterns):
+        level, n = finest, SIDE
         while True:
             begin = number * STRIDE + n * n
             made[begin : begin + n * n] = level.ravel()
@@ -126,3 +135,26 @@ def _leaves(rng: np.random.Generator) -> Floats:
 def means() -> Floats:
     """Return the mean of each pattern, in the order of TEXTURES."""
     return np.array([pattern(name).mean() for name in TEXTURES])
+
+
+def mean_of(finish: Finish, row: int) -> Floats | float:
+    """Return the mean of a surface's pattern; (3,) of an image's red, green and blue."""
+    number = int(finish.texture[row])
+    if number < len(TEXTURES):
+        return float(means()[number])
+    mean: Floats = texels(finish, row).mean(axis=(0, 1))
+    return mean
+
+
+def texels(finish: Finish, row: int) -> Floats:
+    """Return the finest level of a surface's texture (SIDE, SIDE, 3), 0..1 each."""
+    number = int(finish.texture[row])
+    if number < len(TEXTURES):
+        return np.repeat(pattern(TEXTURES[number])[..., None], 3, axis=-1)
+    return texels_of(finish.images[(number - image_number(0)) // 3], SIDE)
+
+
+def periods(finish: Finish) -> Floats:
+    """Return the length of the period (m,) of every surface's pattern, in `Finish.size_m`."""
+    lengths = [PERIOD[name] for name in TEXTURES] + [1.0] * 3 * len(finish.images)
+    return np.array(lengths)[finish.texture]

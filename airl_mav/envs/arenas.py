@@ -17,7 +17,7 @@ from airl_mav.core.kernels import kernel
 class ArenaBatch(NamedTuple):
     """N arenas; obstacle arrays are padded to the greatest number, tours to the longest."""
 
-    bounds: NDArray[np.float64]  # (n, 5) as Bounds.as_array
+    bounds: NDArray[np.float64]  # (n, 6) as Bounds.as_array
     n_obstacles: NDArray[np.int64]  # (n,) static ones first
     n_static: NDArray[np.int64]  # (n,)
     shape: NDArray[np.int8]  # (n, m)
@@ -34,7 +34,7 @@ class ArenaBatch(NamedTuple):
 def empty_batch(n: int, obstacles: int, movers: int, points: int) -> ArenaBatch:
     """Return room for n arenas of at most so many obstacles, movers and way-points each."""
     return ArenaBatch(
-        bounds=np.zeros((n, 5)),
+        bounds=np.zeros((n, 6)),
         n_obstacles=np.zeros(n, np.int64),
         n_static=np.zeros(n, np.int64),
         shape=np.zeros((n, obstacles), np.int8),

@@ -170,7 +170,7 @@ def twin_of(vehicle: VehicleProfile) -> Vehicle:
 def open_space(n: int, obstacles: int = 0) -> ArenaBatch:
     """Return n arenas without walls in reach, and room for obstacles that are not there yet."""
     batch = empty_batch(n, obstacles, 0, 0)
-    batch.bounds[:] = [-FAR_M, FAR_M, -FAR_M, FAR_M, 1e-3]
+    batch.bounds[:] = [-FAR_M, FAR_M, -FAR_M, FAR_M, 1e-3, 0.0]
     batch.goal[:, :2] = [-FAR_M, 0.0]
     batch.n_static[:] = obstacles
     return batch

@@ -15,10 +15,12 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.picture import ColourArrays, write_grey
 from airl_mav.camera.render import Mount, camera_pose
 from airl_mav.camera.textures import atlas
+from airl_mav.core.errors import UsageError
 from airl_mav.core.kernels import kernel
 from airl_mav.envs.arenas import ArenaBatch, copy_rows, move_obstacles
 from airl_mav.envs.fleet import Fleet
 from airl_mav.envs.meshes import MeshBatch, MeshesSeen, meshes_in
+from airl_mav.profiles.image_file import ImageFile
 
 
 class LookBatch(NamedTuple):
@@ -48,9 +50,21 @@ class Looks:
         """Know none yet."""
         self.batch = _empty(n, OBSTACLE)
         """What the kernel looks at; replaced where an arena has more surfaces than all before."""
+        self.images: tuple[ImageFile, ...] = ()
+        """Textures from files, of all arenas."""
 
     def put(self, i: int, arena: Arena) -> None:
-        """Take the look of slot i's arena."""
+        """Take the look of slot i's arena.
+
+        Raises UsageError where its images are others than those of the arenas before.
+        """
+        if images := arena.look.finish.images:
+            if self.images not in ((), images):
+                raise UsageError(
+                    f"arena {arena.name!r}, seed {arena.seed}: appearance.materials: accepted: the"
+                    " same images in all arenas that are flown in side by side"
+                )
+            self.images = images
         look = ColourArrays.of(arena.look)
         room, count = self.batch.texture.shape[1], len(look.texture)
         if count > room:
@@ -98,7 +112,7 @@ class ColourImages:
             self._mount,
             *self._lens,
             *room,
-            atlas(),
+            atlas(self._looks.images),
             out,
         )
 

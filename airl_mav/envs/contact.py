@@ -18,6 +18,7 @@ from airl_mav.vehicle.rotation import Vec
 NOTHING = -1
 FLOOR = -2
 WALL = -3
+CEILING = -4
 
 _BOX = int(Shape.BOX)
 _SPHERE = int(Shape.SPHERE)
@@ -42,6 +43,8 @@ def clearance(
     low = z + half_height
     beside = min(min(x - bounds[0], bounds[1] - x), min(y - bounds[2], bounds[3] - y)) - radius
     room: float = min(-low, max(beside, -bounds[4] - low))
+    if bounds[5] > 0.0:
+        room = min(room, bounds[4] + z - half_height)
     for i in range(count):
         dx, dy, dz = x - center[i, 0], y - center[i, 1], z - center[i, 2]
         hx, hy, hz = half_size[i, 0], half_size[i, 1], half_size[i, 2]
@@ -62,7 +65,7 @@ def touches(
     half_size: NDArray[np.float64],
     yaw: NDArray[np.float64],
 ) -> int:
-    """Return the index of the obstacle that the vehicle overlaps, or FLOOR, WALL, NOTHING.
+    """Return the index of the obstacle that the vehicle overlaps, or FLOOR, CEILING, WALL, NOTHING.
 
     Args:
         position: Vehicle NED [m].
@@ -78,6 +81,8 @@ def touches(
     x, y, z = position
     if z + half_height > 0.0:
         return FLOOR
+    if bounds[5] > 0.0 and z - half_height < -bounds[4]:
+        return CEILING
     if z + half_height > -bounds[4] and (
         x - radius < bounds[0]
         or x + radius > bounds[1]

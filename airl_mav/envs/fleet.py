@@ -63,7 +63,7 @@ class Fleet(NamedTuple):
     energy: NDArray[np.float64]  # (n,) of the vehicle since the start, its computer apart [J]
     battery: NDArray[np.float64]  # (n,) state of charge, 1 full to 0 empty
     room: NDArray[np.float64]  # (n,) it and the obstacles move so far without contact; 0: look [m]
-    touched: NDArray[np.int64]  # (n,) first contact: obstacle, FLOOR, WALL, or NOTHING
+    touched: NDArray[np.int64]  # (n,) first contact: obstacle, FLOOR, ..., or NOTHING
     verdict: NDArray[np.int64]  # (n,) Verdict
     airframe: NDArray[np.float64]  # (n, fields of Airframe) each one's own
 

@@ -86,7 +86,7 @@ class Flights:
     battery: NDArray[np.float64]
     """Charge left, 1 to 0."""
     touched: NDArray[np.int64]
-    """Index of the obstacle that is touched, or `contact.FLOOR`, `WALL`, `NOTHING`."""
+    """Index of the obstacle that is touched, or `contact.FLOOR`, `CEILING`, `WALL`, `NOTHING`."""
 
     def with_rows(self, rows: Rows, others: Flights) -> Flights:
         """Return these with `others` in their rows."""

@@ -9,7 +9,7 @@ from typing import Any
 
 from airl_mav.arena.geometry import Arena
 from airl_mav.core.constants import US_PER_S
-from airl_mav.envs.contact import FLOOR, WALL
+from airl_mav.envs.contact import CEILING, FLOOR, WALL
 from airl_mav.envs.evaluation import (
     OUTCOMES,
     EpisodeResult,
@@ -221,6 +221,5 @@ def _reason(outcome: Outcome, flights: Flights, slot: int, arena: Arena, limit_s
 
 def _name(arena: Arena, touched: int) -> str:
     """Return what was hit, as the plant calls it."""
-    if touched in (FLOOR, WALL):
-        return "floor" if touched == FLOOR else "wall"
-    return arena.name_of(touched)
+    room = {FLOOR: "floor", WALL: "wall", CEILING: "ceiling"}
+    return room[touched] if touched in room else arena.name_of(touched)

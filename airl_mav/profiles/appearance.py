@@ -7,9 +7,10 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from airl_mav.core.fields import Each, ProfileModel, quantity
+from airl_mav.profiles.image_file import MOST_IMAGES, ImageFile
 
 TextureName = Literal["plain", "checker", "noise", "brick", "foliage"]
 Colour = Annotated[tuple[int, int, int], Each(0, 255)]
@@ -20,10 +21,12 @@ WALL_COLOUR = "wall_colour"
 
 
 class Material(ProfileModel):
-    """A matt (Lambertian) material: two albedos, and the texture that mixes them."""
+    """A matt (Lambertian) material: two albedos, and the texture that mixes them; or an image."""
 
     albedo: Colour = quantity(
-        "reflectance, as an sRGB colour, where the pattern is 0: mortar, shade between leaves", "1"
+        "reflectance, as an sRGB colour, where the pattern is 0: mortar, shade between leaves; with"
+        " an image: where that is white",
+        "1",
     )
     albedo_2: Colour | None = quantity(
         "reflectance where the pattern is 1: bricks, leaves; left out: as albedo",
@@ -36,12 +39,32 @@ class Material(ProfileModel):
         " leaves over each other",
     )
     size_m: float = quantity(
-        "side of a check, length of a brick, width of a leaf, wavelength of the coarsest noise",
+        "side of a check, length of a brick, width of a leaf, wavelength of the coarsest noise,"
+        " width of an image",
         "m",
         ge=0.02,
         le=50,
         default=0.5,
     )
+    image: ImageFile | None = Field(
+        default=None, description="a picture of your own in place of a pattern"
+    )
+
+    @model_serializer(mode="wrap")
+    def _without_unused(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out an image where there is none: the digest is that of before there were."""
+        data: dict[str, Any] = dump(self)
+        if self.image is None:
+            data.pop("image", None)  # gone already where what is None is left out
+        return data
+
+    @model_validator(mode="after")
+    def _image_or_pattern(self) -> Material:
+        if self.image is not None and self.texture != "plain":
+            raise ValueError(f"texture = {self.texture!r}: accepted: none with an image")
+        if self.image is not None and self.albedo_2 is not None:
+            raise ValueError(f"albedo_2 = {list(self.albedo_2)}: accepted: none with an image")
+        return self
 
 
 MATERIALS: dict[str, Material] = {
@@ -209,6 +232,10 @@ class Appearance(ProfileModel):
     @model_validator(mode="after")
     def _materials_are_known(self) -> Appearance:
         known = self.known_materials
+        if len(self.images) > MOST_IMAGES:
+            raise ValueError(
+                f"materials: {len(self.images)} with an image; accepted: {MOST_IMAGES} at most"
+            )
         if WALL_COLOUR in self.materials:
             raise ValueError(f"materials.{WALL_COLOUR}: this name stands for the arena's own field")
         for kind in ("floor", "walls", "static", "moving"):
@@ -221,6 +248,12 @@ class Appearance(ProfileModel):
     def known_materials(self) -> tuple[str, ...]:
         """The names of all materials: shipped ones, the walls', the arena's own."""
         return (*MATERIALS, WALL_COLOUR, *self.materials)
+
+    @property
+    def images(self) -> tuple[ImageFile, ...]:
+        """The pictures of its own materials, each once, in the order of their names."""
+        named = sorted(self.materials.items())
+        return tuple(dict.fromkeys(m.image for _, m in named if m.image is not None))
 
     def material(self, name: str, wall_colour: tuple[int, int, int]) -> Material:
         """Return a material by name; one of the arena's own goes before a shipped one."""

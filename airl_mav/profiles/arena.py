@@ -18,6 +18,7 @@ from airl_mav.core.plugins import GENERATORS, part_name
 from airl_mav.profiles.appearance import DEFAULT, Appearance
 from airl_mav.profiles.assets import ASSETS, Asset
 from airl_mav.profiles.gates import Gates, check_gates
+from airl_mav.profiles.rooms import HEADROOM_M, Rooms, check_rooms
 
 ShapeName = Literal["box", "cylinder", "sphere"]
 SHAPES: tuple[ShapeName, ...] = get_args(ShapeName)
@@ -39,6 +40,11 @@ class Size(ProfileModel):
     north_m: float = quantity("length of the floor, south to north", "m", ge=5, le=500, default=50)
     east_m: float = quantity("width of the floor, west to east", "m", ge=5, le=500, default=50)
     height_m: float = quantity("height of the walls", "m", ge=1, le=50, default=5)
+    ceiling: bool = Field(
+        default=False,
+        description="whether there is one, at the height of the walls: nothing flies over walls and"
+        " gates, the sun does not reach the floor, and the ceiling glows as the sky would",
+    )
 
 
 class Start(ProfileModel):
@@ -195,6 +201,9 @@ class ArenaSpec(ProfileModel):
     gates: Gates = Field(
         default_factory=Gates, description="walls with openings that are on the way to the goal"
     )
+    rooms: Rooms = Field(
+        default_factory=Rooms, description="walls that divide the arena, with doors between rooms"
+    )
     assets: dict[str, Asset] = Field(
         default_factory=dict, description="things of your own, made of parts, by name"
     )
@@ -221,10 +230,14 @@ class ArenaSpec(ProfileModel):
             silent += ["assets", "asset_scale"]
         if self.gates == Gates():
             silent.append("gates")
+        if self.rooms == Rooms():
+            silent.append("rooms")
         for name in silent:
             data.pop(name, None)
         if self.goal.height_m is None:
             data.get("goal", {}).pop("height_m", None)
+        if not self.size.ceiling:
+            data.get("size", {}).pop("ceiling", None)
         return data
 
     @property
@@ -242,6 +255,8 @@ class ArenaSpec(ProfileModel):
         self._check_goal()
         self._check_assets()
         self._check_gates()
+        self._check_rooms()
+        self._check_ceiling()
         for name in ("static", "moving"):
             self._check_heights(name, getattr(self, name))
         return self
@@ -295,6 +310,29 @@ class ArenaSpec(ProfileModel):
             free_m=self.start.clearance_m,
         )
         self._check_behind_gates()
+
+    def _check_rooms(self) -> None:
+        rooms = self.rooms
+        if not rooms.drawn:
+            return
+        if self.generator != OBSTACLES or self.gates.count[1] > 0:
+            why = "gates" if self.gates.count[1] > 0 else "a generator of your own"
+            raise ValueError(f"rooms.count = {list(rooms.count)}: accepted: [0, 0] with {why}")
+        check_rooms(
+            rooms,
+            north_m=self.size.north_m,
+            east_m=self.size.east_m,
+            height_m=self.size.height_m,
+            flight_altitude_m=self.flight_altitude_m,
+        )
+
+    def _check_ceiling(self) -> None:
+        least = self.flight_altitude_m + HEADROOM_M
+        if self.size.ceiling and self.size.height_m < least:
+            raise ValueError(
+                f"size.height_m = {self.size.height_m:g}: accepted: value >= {least:g} m below a "
+                f"ceiling ({HEADROOM_M:g} m above flight_altitude_m {self.flight_altitude_m:g})"
+            )
 
     def _check_behind_gates(self) -> None:
         """Refuse gates that leave no room for the goal behind the last of them."""

@@ -13,7 +13,7 @@ from pydantic import BaseModel
 from airl_mav.core.errors import UsageError, shown
 from airl_mav.core.fields import validated
 from airl_mav.core.files import DEEPEST, deeper_than
-from airl_mav.profiles.mesh_file import CONTENT, MeshFile, read_checked
+from airl_mav.profiles.mesh_file import CONTENT, CheckedFile, read_checked
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -74,7 +74,9 @@ def load_profile(kind: Kind, name: str, model: type[Model]) -> Model:
     profile = validated(model, data, path)
     for asset in getattr(profile, "assets", {}).values():
         if asset.mesh is not None:
-            _check_mesh(asset.mesh, path)
+            _check_file(asset.mesh, path, "assets")
+    for image in getattr(getattr(profile, "appearance", None), "images", ()):
+        _check_file(image, path, "appearance.materials")
     return profile
 
 
@@ -104,7 +106,7 @@ def _read(kind: Kind, path: Path, above: tuple[Path, ...]) -> dict[str, Any]:
     if kind == "vehicles":
         _name_power_model(data, path)
     if kind == "arenas":
-        _anchor_meshes(data, path)
+        _anchor_files(data, path)
     base = data.pop("base", None)
     if base is None:
         return data
@@ -134,21 +136,25 @@ def read_toml(path: Path) -> dict[str, Any]:
     return found
 
 
-def _anchor_meshes(data: dict[str, Any], path: Path) -> None:
-    """Make paths to the meshes of assets absolute: they are told from their profile's folder."""
-    assets = data.get("assets")
-    for asset in assets.values() if isinstance(assets, dict) else ():
-        mesh = asset.get("mesh") if isinstance(asset, dict) else None
-        if isinstance(mesh, dict) and isinstance(file := mesh.get("file"), str) and file:
-            mesh["file"] = str(path.parent.absolute() / file)
+def _anchor_files(data: dict[str, Any], path: Path) -> None:
+    """Make paths to meshes and images absolute: they are told from their profile's folder."""
+    look = data.get("appearance")
+    for owners, field in (
+        (data.get("assets"), "mesh"),
+        (look.get("materials") if isinstance(look, dict) else None, "image"),
+    ):
+        for owner in owners.values() if isinstance(owners, dict) else ():
+            named = owner.get(field) if isinstance(owner, dict) else None
+            if isinstance(named, dict) and isinstance(file := named.get("file"), str) and file:
+                named["file"] = str(path.parent.absolute() / file)
 
 
-def _check_mesh(mesh: MeshFile, path: Path) -> None:
-    """Raise UsageError, in the name of the profile, where a mesh is gone or another one."""
+def _check_file(named: CheckedFile, path: Path, table: str) -> None:
+    """Raise UsageError, in the name of the profile, where a file is gone or another one."""
     try:
-        read_checked(mesh)
+        read_checked(named)
     except UsageError as error:
-        raise UsageError(f"{path}: assets: {error}") from None
+        raise UsageError(f"{path}: {table}: {error}") from None
 
 
 def _name_power_model(data: dict[str, Any], path: Path) -> None:

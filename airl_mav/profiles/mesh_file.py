@@ -1,4 +1,4 @@
-"""The file of a mesh that cameras see in place of an asset's parts, and whether it has changed."""
+"""Files that an arena's profile names, with their digests: the meshes that cameras see."""
 
 from __future__ import annotations
 
@@ -23,18 +23,17 @@ MOST_TRIANGLES = 200_000
 GREATEST_M = 50.0
 """Greatest distance of a corner from its asset's place, along each axis [m]."""
 
+MOST_BYTES = 1 << 27
+"""Of one file."""
+
 CONTENT = {"content": True}
 """Context of a serialisation that says what things are, and not where they lie."""
 
 
-class MeshFile(ProfileModel):
-    """Triangles that cameras see in place of the parts, which stay what is hit."""
+class CheckedFile(ProfileModel):
+    """A file beside a profile that must be what it was when the profile was made."""
 
-    file: str = Field(
-        min_length=1,
-        description="the triangles, as `airl asset` writes them (.npz); a path from the profile's"
-        " folder",
-    )
+    file: str = Field(min_length=1, description="a path from the profile's folder")
     sha256: str = Field(description="SHA-256 of that file, hexadecimal")
 
     @field_validator("sha256")
@@ -55,16 +54,32 @@ class MeshFile(ProfileModel):
         return data
 
 
-def read_checked(mesh: MeshFile) -> bytes:
+class MeshFile(CheckedFile):
+    """Triangles that cameras see in place of the parts, which stay what is hit."""
+
+    file: str = Field(
+        min_length=1,
+        description="the triangles, as `airl asset` writes them (.npz); a path from the profile's"
+        " folder",
+    )
+
+
+def read_checked(named: CheckedFile) -> bytes:
     """Return the bytes of a file. Raises UsageError where it is gone, or another one."""
+    path = Path(named.file)
     try:
-        data = Path(mesh.file).read_bytes()
+        if path.exists() and not path.is_file():
+            raise UsageError(f"{named.file}: no file")
+        with path.open("rb") as file:
+            data = file.read(MOST_BYTES + 1)
     except OSError as error:
-        raise UsageError(f"{mesh.file}: {error.strerror}") from None
+        raise UsageError(f"{named.file}: {error.strerror}") from None
+    if len(data) > MOST_BYTES:
+        raise UsageError(f"{named.file}: accepted: a file of at most {MOST_BYTES:,} bytes")
     found = hashlib.sha256(data).hexdigest()
-    if found != mesh.sha256:
+    if found != named.sha256:
         raise UsageError(
-            f"{mesh.file}: changed since its arena was made: SHA-256 {found[:16]}...; accepted: "
-            f"{mesh.sha256[:16]}..."
+            f"{named.file}: changed since its arena was made: SHA-256 {found[:16]}...; accepted: "
+            f"{named.sha256[:16]}..."
         )
     return data

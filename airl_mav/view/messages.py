@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from airl_mav.arena.appearance import Statics
-from airl_mav.arena.geometry import Arena, Bounds, Obstacles, PlacedMesh, Tour
+from airl_mav.arena.geometry import Arena, Bounds, Building, Obstacles, PlacedMesh, Tour
 from airl_mav.core.goals import Goal
 from airl_mav.profiles.appearance import DEFAULT, Appearance
 from airl_mav.profiles.mesh_file import MeshFile
@@ -93,6 +93,8 @@ class ArenaShown(Message):
     meshes: tuple[MeshShown, ...] = ()
     goal_height_m: float | None = None
     n_gates: int = 0
+    ceiling: bool = False
+    building: Building | None = None
 
     @classmethod
     def of(cls, arena: Arena) -> ArenaShown:
@@ -106,7 +108,7 @@ class ArenaShown(Message):
         return cls(
             name=arena.name,
             seed=arena.seed,
-            bounds=_row(arena.bounds.as_array()),
+            bounds=_row(arena.bounds.as_array()[:5]),
             wall_colour=arena.wall_colour,
             shape=tuple(obstacles.shape.tolist()),
             center=_rows(obstacles.center),
@@ -122,6 +124,8 @@ class ArenaShown(Message):
             meshes=tuple(map(MeshShown.of, arena.meshes)),
             goal_height_m=arena.goal_height_m,
             n_gates=arena.n_gates,
+            ceiling=arena.bounds.ceiling,
+            building=arena.building,
         )
 
     def arena(self) -> Arena:
@@ -130,7 +134,7 @@ class ArenaShown(Message):
         return Arena(
             name=self.name,
             seed=self.seed,
-            bounds=Bounds(*self.bounds),
+            bounds=Bounds(*self.bounds, ceiling=self.ceiling),
             wall_colour=self.wall_colour,
             obstacles=Obstacles(
                 np.array(self.shape, np.int8),
@@ -147,6 +151,7 @@ class ArenaShown(Message):
             meshes=tuple(each.placed() for each in self.meshes),
             goal_height_m=self.goal_height_m,
             n_gates=self.n_gates,
+            building=self.building,
         )
 
 

@@ -346,10 +346,10 @@ class FlightScene:
 
 
 def walls(bounds: Bounds) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
-    """Return the four walls as a mesh whose front is inside.
+    """Return the four walls, and the ceiling where there is one, as a mesh whose front is inside.
 
     Returns:
-        Corners (8, 3) NED [m], and the corners of the triangles (8, 3).
+        Corners (8, 3) NED [m], and the corners of the triangles (8 or 10, 3).
     """
     b = bounds
     ends = [
@@ -362,6 +362,8 @@ def walls(bounds: Bounds) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
     faces = []
     for here, after in ((0, 1), (1, 2), (2, 3), (3, 0)):
         faces += [(here, after, after + 4), (here, after + 4, here + 4)]
+    if b.ceiling:
+        faces += [(4, 5, 6), (4, 6, 7)]
     return np.array(corners, np.float32), np.array(faces, np.uint32)
 
 

@@ -16,6 +16,8 @@ FLOOR = "floor"
 
 WALLS = ("wall-north", "wall-south", "wall-east", "wall-west")
 
+CEILING = "ceiling"
+
 
 class Touch(NamedTuple):
     """What the vehicle has contacts with, by the numbers of the bodies."""
@@ -80,9 +82,9 @@ class Body(Protocol):
 
 
 def walls_of(arena: Arena) -> list[tuple[str, Vec, Vec]]:
-    """Return the walls of an arena as boxes: name, centre NED [m], half extents N, E, D [m].
+    """Return walls and ceiling of an arena as boxes: name, centre NED, half extents N, E, D [m].
 
-    Their inner faces stand on the bounds.
+    Their inner faces are on the bounds.
     """
     b = arena.bounds
     t, h = 0.5 * WALL_THICKNESS_M, 0.5 * b.height
@@ -96,4 +98,8 @@ def walls_of(arena: Arena) -> list[tuple[str, Vec, Vec]]:
         (north, b.east_min - t, -h),
     )
     halves = (along_east, along_east, along_north, along_north)
-    return list(zip(WALLS, centers, halves, strict=True))
+    walls: list[tuple[str, Vec, Vec]] = list(zip(WALLS, centers, halves, strict=True))
+    if b.ceiling:
+        over = (half_n + 2 * t, half_e + 2 * t, t)
+        walls.append((CEILING, (north, east, -b.height - t), over))
+    return walls

@@ -11,8 +11,12 @@ import pybullet
 import pytest
 from scipy.spatial.transform import Rotation
 
+from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape
+from airl_mav.arena.rooms import over_doors
 from airl_mav.core.constants import TICK_S, TICK_US
+from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.profiles.loading import load_profile
 from airl_mav.scenario.aircraft import Aircraft
 from firmware_sim.interfaces import ActuatorControls
 from firmware_sim.plant.bullet import connect
@@ -167,3 +171,54 @@ def test_a_wall_stops_it_and_lets_it_fall(name: str) -> None:
     assert [hit.what for hit in plant.collisions][:2] == ["wall-north", "floor"]
     assert plant.position[0] < 20.0
     assert plant.position[2] == pytest.approx(-0.5 * HEIGHT, abs=0.25)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_both_bodies_hit_walls_doors_and_ceiling_as_plain_pybullet(seed: int) -> None:
+    """Thrown at room walls, at lintels, at the ceiling, and through doors to what is behind them.
+
+    Times are those of the same tick, but for a few of the kernel's.
+    """
+    spec = load_profile("arenas", "rooms", ArenaSpec)
+    place = generate(spec, seed, name="rooms", vehicle_width_m=WIDTH)
+    assert place.building is not None
+    o, n = place.obstacles, place.n_static
+    rng, plain = np.random.default_rng(seed), PlainWorld(place)
+    plants = [
+        Plant(VEHICLE, place, np.random.default_rng(0), aircraft=Aircraft(plant=name))
+        for name in ("pybullet", "kernel")
+    ]
+    lintels = np.flatnonzero(over_doors(place))
+    late, names = [], []
+    for k in range(24):
+        target = o.center[rng.integers(n - place.building.boxes, n)].copy()
+        if k % 2:
+            target = o.center[rng.choice(lintels)].copy()
+        target[2] += 0.8 * (k % 3 == 1)  # below some lintels is a door
+        across = rng.uniform(-2.5, 2.5, 2)
+        position = np.array([*(target[:2] + across), rng.uniform(-3.0, -2.0)])
+        b = place.bounds
+        position[0] = np.clip(position[0], b.north_min + 0.5, b.north_max - 0.5)
+        position[1] = np.clip(position[1], b.east_min + 0.5, b.east_max - 0.5)
+        gap = np.abs(position - o.center[:n]) - o.half_size[:n]
+        if gap.max(axis=1).min() < 0.35:
+            continue
+        velocity = 7.0 * (target - position) / np.linalg.norm(target - position)
+        if k % 4 == 2:
+            velocity = np.array([1.0, -0.5, -7.0])
+        theirs = plain.throw(position, velocity)[0]
+        for plant in plants:
+            plant.put(tuple(position), tuple(velocity))
+            for _ in range(THROW_TICKS):
+                plant.step(OFF)
+            first = plant.collisions[0]
+            assert first.what.replace("room-wall", "box") == theirs[1]
+            late.append((plant is plants[1], abs(first.time_us - theirs[0])))
+        names.append(first.what)
+    for plant in plants:
+        plant.close()
+    plain.client.disconnect()
+    assert all(apart == 0 for kernel, apart in late if not kernel)
+    assert max(apart for _, apart in late) <= 2 * TICK_US
+    assert "ceiling" in names
+    assert sum("room-wall" in name for name in names) >= 4

@@ -84,6 +84,12 @@ class PlainWorld:
             )
             body = self.client.createMultiBody(0, shape, basePosition=(east, north, 0.5 * b.height))
             self.names[body] = f"wall-{name}"
+        if b.ceiling:
+            shape = self.client.createCollisionShape(
+                pybullet.GEOM_BOX, halfExtents=(100.0, 100.0, thick)
+            )
+            above = (middle[1], middle[0], b.height + thick)
+            self.names[self.client.createMultiBody(0, shape, basePosition=above)] = "ceiling"
         o, self.movers = place.obstacles, []
         for i, (shape_kind, half_size) in enumerate(zip(o.shape, o.half_size, strict=True)):
             x, _, z = half_size

@@ -127,6 +127,31 @@ def test_a_blue_sky_is_theirs() -> None:
     assert inner < 0.03
 
 
+INDOORS = [
+    (1, (0.0, 0.0, -2.5), 0.0),
+    (3, (10.0, 5.0, -1.5), -1.0),
+    (4, (20.0, -5.0, -3.0), 3.0),
+    (5, (15.0, 8.0, -2.0), 1.0),
+]
+
+
+@pytest.mark.parametrize(("seed", "position", "yaw"), INDOORS)
+def test_rooms_below_a_ceiling_are_within_three_percent(
+    seed: int, position: tuple[float, float, float], yaw: float
+) -> None:
+    """The same ceiling lights both; one of them follows its light from wall to wall."""
+    scene = generate(
+        load_profile("arenas", "rooms", ArenaSpec), seed, name="rooms", vehicle_width_m=0.55
+    )
+    inner, _ = difference(scene, position, yaw, rays=4)
+    assert inner < 0.03
+    # As much light as the whole ceiling would give is too much: the means are worth something.
+    look = scene.look
+    assert look.light.inside is not None
+    scene.__dict__["look"] = replace(look, light=replace(look.light, inside=None))
+    assert difference(scene, position, yaw, rays=4)[0] > 1.3 * inner
+
+
 @pytest.mark.parametrize("material", ["plaster", "brick"])
 def test_meshes_are_theirs(material: str, tmp_path: Path) -> None:
     """Triangles with their shadows, and with bricks as they lie on them."""

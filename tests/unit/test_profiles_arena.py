@@ -14,7 +14,10 @@ from airl_mav.core.fields import range_of, unit_of
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 
-NO_NUMBERS = ("description", "shapes", "generator", "options", "materials", "assets")
+NO_NUMBERS = (
+    *("description", "shapes", "generator", "options", "materials", "assets"),
+    "ceiling",
+)
 
 
 def load(text: str, folder: Path) -> ArenaSpec:

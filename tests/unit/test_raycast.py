@@ -124,6 +124,8 @@ class Rays:
             self.rectangle(self.d, self.o, axis, low[axis], low, high)
             self.rectangle(self.d, self.o, axis, high[axis], low, high)
         self.rectangle(self.d, self.o, 2, 0.0, low, high)
+        if b.ceiling:
+            self.rectangle(self.d, self.o, 2, low[2], low, high)
 
     def box(self, center: np.ndarray, half: np.ndarray, yaw: float) -> bool:
         turn = Rotation.from_euler("z", -yaw).as_matrix()
@@ -238,6 +240,23 @@ def test_agrees_with_brute_force(projection: Projection, seed: int) -> None:
     assert returns > 15_000
     assert escapes > 3_000
     assert inside > 0
+
+
+@pytest.mark.parametrize("projection", PROJECTIONS)
+def test_a_ceiling_agrees_with_brute_force(projection: Projection) -> None:
+    """From inside, from above and from beside: of every scene with and without it."""
+    rng = np.random.default_rng(77)
+    overhead = 0
+    for number in range(100):
+        scene = random_scene(rng)
+        if projection == "cylindrical":
+            scene = all_round(scene, rng)
+        closed = replace(scene, bounds=replace(scene.bounds, ceiling=True))
+        depth, expected = closed.render(), brute_force(closed)[0]
+        error = float(np.max(np.abs(depth - expected)))
+        assert error < 1e-4, f"scene {number}: {error} m, {closed}"
+        overhead += int(np.count_nonzero(expected != brute_force(scene)[0]))
+    assert overhead > 3_000
 
 
 # --- pybullet ------------------------------------------------------------------------------------

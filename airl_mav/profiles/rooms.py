@@ -1,0 +1,138 @@
+"""Rooms in an arena's profile: walls inside of it, with doors between rooms."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated
+
+from airl_mav.core.fields import Each, ProfileModel, quantity
+
+ROOM_WALL = "room-wall"
+"""What a wall between rooms, and what is above its doors, is called where it is hit."""
+
+EDGE_M = 0.1
+"""Least wall on each side of a door [m]."""
+
+HEADROOM_M = 0.5
+"""Least height of a door, and of a ceiling, above what flies at the flight altitude [m]."""
+
+
+class Rooms(ProfileModel):
+    """Walls that divide the arena into rooms, each of which can be reached through doors.
+
+    The walls are as high as those of the arena. Ranges are [least, greatest], drawn uniformly.
+    """
+
+    count: Annotated[tuple[int, int], Each(0, 100, ascending=True)] = quantity(
+        "how many rooms, beside the corridor; [0, 0]: the arena is not divided",
+        "1",
+        default=(0, 0),
+    )
+    least_side_m: float = quantity("least side of a room", "m", ge=1, le=100, default=5)
+    thickness_m: float = quantity("of the walls", "m", ge=0.05, le=2, default=0.2)
+    door_width_m: Annotated[tuple[float, float], Each(0.3, 20, ascending=True)] = quantity(
+        "width of a door, drawn for each", "m", default=(1.6, 2.4)
+    )
+    door_height_m: Annotated[tuple[float, float], Each(0.3, 50, ascending=True)] = quantity(
+        "height of a door, drawn for each; above it the wall goes on, and not where it is as high"
+        " as the walls",
+        "m",
+        default=(3.2, 3.6),
+    )
+    door_clearance_m: float = quantity(
+        "free way before and behind a door, for standing and moving obstacles",
+        "m",
+        ge=0,
+        le=20,
+        default=1.5,
+    )
+    extra_doors: float = quantity(
+        "share of the neighbouring rooms without a door between them that get one as well; 0: one"
+        " way leads from each room to each other, 1: neighbours have a door",
+        "1",
+        ge=0,
+        le=1,
+        default=0.25,
+    )
+    corridor_width_m: float | None = quantity(
+        "width of a corridor along the longer side of the arena, on which every room opens; left"
+        " out: there is none",
+        "m",
+        ge=1,
+        le=50,
+        default=None,
+    )
+
+    @property
+    def drawn(self) -> bool:
+        """Whether there are any."""
+        return self.count[1] > 0
+
+    def slots(self, length_m: float) -> int:
+        """Return how many rooms of the least side fit in a row of a length [m]."""
+        # What fits exactly fits, whatever the last bit of the division.
+        return max(0, math.floor((length_m + self.thickness_m) / self._step_m + 1e-9))
+
+    @property
+    def _step_m(self) -> float:
+        return self.least_side_m + self.thickness_m
+
+
+def check_rooms(
+    rooms: Rooms, *, north_m: float, east_m: float, height_m: float, flight_altitude_m: float
+) -> None:
+    """Raise ValueError for rooms that no arena of a size can have.
+
+    Args:
+        rooms: One at least.
+        north_m: Length of the floor, south to north [m].
+        east_m: Width of the floor, west to east [m].
+        height_m: Of the walls [m].
+        flight_altitude_m: Height above the floor at which a vehicle must fit through doors [m].
+    """
+    if rooms.count[0] == 0:
+        raise ValueError(
+            f"rooms.count = {list(rooms.count)}: accepted: 1 <= value, or [0, 0] for none"
+        )
+    _check_doors(rooms, height_m, flight_altitude_m)
+    most, where = _most(rooms, max(north_m, east_m), min(north_m, east_m))
+    if rooms.count[1] > most:
+        raise ValueError(
+            f"rooms.count = {list(rooms.count)}: accepted: value <= {most}, as many of "
+            f"rooms.least_side_m {rooms.least_side_m:g} as fit {where} (size.north_m {north_m:g}, "
+            f"size.east_m {east_m:g})"
+        )
+    if rooms.corridor_width_m is not None and rooms.count[0] < 2:
+        raise ValueError(
+            f"rooms.count = {list(rooms.count)}: accepted: 2 <= value, one on each side of the"
+            " corridor"
+        )
+
+
+def _check_doors(rooms: Rooms, height_m: float, flight_altitude_m: float) -> None:
+    low, high = flight_altitude_m + HEADROOM_M, height_m
+    if not low <= rooms.door_height_m[0] <= rooms.door_height_m[1] <= high:
+        raise ValueError(
+            f"rooms.door_height_m = {list(rooms.door_height_m)}: accepted: {low:g} <= value <= "
+            f"{high:g} m ({HEADROOM_M:g} m above flight_altitude_m {flight_altitude_m:g}, up to "
+            "size.height_m)"
+        )
+    widest = rooms.least_side_m - 2.0 * EDGE_M
+    if rooms.door_width_m[1] > widest:
+        raise ValueError(
+            f"rooms.door_width_m = {list(rooms.door_width_m)}: accepted: value <= {widest:g} m "
+            f"(rooms.least_side_m {rooms.least_side_m:g}, and {EDGE_M:g} m of wall on either side)"
+        )
+
+
+def _most(rooms: Rooms, longer_m: float, shorter_m: float) -> tuple[int, str]:
+    """Return how many rooms always fit into a floor, and where."""
+    along = rooms.slots(longer_m)
+    if rooms.corridor_width_m is None:
+        return along * rooms.slots(shorter_m), "side by side"
+    beside = shorter_m - rooms.corridor_width_m - 2.0 * rooms.thickness_m
+    fits = beside >= 2.0 * rooms.least_side_m - 1e-9
+    return (
+        2 * along if fits else 0,
+        f"on both sides of a corridor {rooms.corridor_width_m:g} m wide",
+    )
