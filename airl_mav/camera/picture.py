@@ -68,10 +68,11 @@ def render_picture(
     intrinsics: Intrinsics,
     position: Vec | NDArray[np.float64],
     quaternion: Quat | NDArray[np.float64],
+    gain: float = 1.0,
 ) -> Picture:
     """Return the colour image of an arena, with depth and what is seen; arguments as of `render`.
 
-    Depth has no limit of range.
+    Depth has no limit of range. All light is times `gain`, before it becomes numbers.
 
     Raises:
         UsageError: The file of a mesh cannot be read, or is another one.
@@ -81,6 +82,7 @@ def render_picture(
     # Tuples and arrays of the types that the batch twin hands over: one compiled kernel for both.
     north, east, down = (float(part) for part in position)
     q0, q1, q2, q3 = (float(part) for part in quaternion)
+    lights = look.lights if gain == 1.0 else _brightened(look.lights, gain)
     picture = Picture(
         np.empty((*shape, 3), np.uint8), np.empty(shape, np.float32), np.empty(shape, np.int32)
     )
@@ -103,10 +105,17 @@ def render_picture(
         look.per_m,
         look.offset,
         look.albedo,
-        look.lights,
+        lights,
         atlas(),
     )
     return picture
+
+
+def _brightened(lights: NDArray[np.float32], gain: float) -> NDArray[np.float32]:
+    """Return the lights (7, 3) of `ColourArrays` times a gain: neither direction nor fog."""
+    brighter = lights.copy()
+    brighter[1:6] *= np.float32(gain)
+    return brighter
 
 
 def grey(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -46,11 +46,14 @@ class Looks:
 
     def __init__(self, n: int) -> None:
         """Know none yet."""
+        self.arenas: list[Arena | None] = [None] * n
+        """Those that it knows the looks of."""
         self.batch = _empty(n, OBSTACLE)
         """What the kernel looks at; replaced where an arena has more surfaces than all before."""
 
     def put(self, i: int, arena: Arena) -> None:
         """Take the look of slot i's arena."""
+        self.arenas[i] = arena
         look = ColourArrays.of(arena.look)
         room, count = self.batch.texture.shape[1], len(look.texture)
         if count > room:

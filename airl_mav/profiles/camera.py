@@ -6,10 +6,11 @@ from typing import Any
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
-from airl_mav.core.constants import US_PER_S
+from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.profiles.camera_kind import CameraKind
+from airl_mav.profiles.imaging import Imaging
 from airl_mav.profiles.projection import CYLINDER_MOST_DEG, Projection, check_fov
 
 
@@ -59,6 +60,11 @@ class Camera(ProfileModel):
         description="how depth is matched, of a depth camera with a pinhole; left out: depth"
         " without error",
     )
+    imaging: Imaging | None = Field(
+        default=None,
+        description="how the image of an rgb or grey camera is formed; left out: as the ray caster"
+        " draws it",
+    )
 
     @model_validator(mode="after")
     def _projects(self) -> Camera:
@@ -68,6 +74,8 @@ class Camera(ProfileModel):
                 "camera.stereo", self.projection, "left out where the projection is not pinhole"
             )
         check_matched("camera.kind", self)
+        if self.imaging is not None:
+            _check_imaging(self.imaging, self)
         return self
 
     @model_serializer(mode="wrap")
@@ -80,6 +88,8 @@ class Camera(ProfileModel):
             data.pop("projection", None)
         if self.stereo is None:
             data.pop("stereo", None)
+        if self.imaging is None:
+            data.pop("imaging", None)
         return data
 
     @property
@@ -89,8 +99,25 @@ class Camera(ProfileModel):
 
 
 def check_matched(field: str, camera: Camera) -> None:
-    """Raise FieldError, naming the field, for stereo matching where no depth is measured."""
+    """Raise FieldError, naming the field, for stereo matching or imaging of another kind."""
+    if camera.imaging is not None and camera.kind == "depth":
+        raise FieldError(
+            field,
+            camera.kind,
+            problem="with a table camera.imaging; accepted: rgb or grey with one",
+        )
     if camera.stereo is not None and camera.kind != "depth":
         raise FieldError(
             field, camera.kind, problem="with a table camera.stereo; accepted: 'depth' with one"
         )
+
+
+def _check_imaging(imaging: Imaging, camera: Camera) -> None:
+    """Raise FieldError for what a camera's kind or rate cannot have."""
+    if imaging.bayer and camera.kind != "rgb":
+        accepted = f"false with a camera of kind {camera.kind!r}"
+        raise FieldError("camera.imaging.bayer", True, accepted)
+    period_ms = camera.period_us / US_PER_MS
+    if imaging.exposure_ms > period_ms:
+        accepted = f"value <= {period_ms:.4g} ms, the time between two frames"
+        raise FieldError("camera.imaging.exposure_ms", imaging.exposure_ms, accepted)
