@@ -23,14 +23,20 @@ MAGICS: dict[tuple[CameraKind, Projection], bytes] = {
     ("rgb", "cylindrical"): b"ARC1",
     ("grey", "pinhole"): b"AGF1",
     ("grey", "cylindrical"): b"AGC1",
+    ("depth", "fisheye"): b"ADE1",
+    ("rgb", "fisheye"): b"ARE1",
+    ("grey", "fisheye"): b"AGE1",
 }
-"""How a frame begins: air-learning depth, RGB or grey, frame or cylinder, version 1."""
+"""How a frame begins: air-learning depth, RGB or grey; frame, cylinder, or equidistant fisheye;
+version 1."""
 
 JPEG_MAGICS: dict[tuple[CameraKind, Projection], bytes] = {
     ("rgb", "pinhole"): b"JRF1",
     ("rgb", "cylindrical"): b"JRC1",
     ("grey", "pinhole"): b"JGF1",
     ("grey", "cylindrical"): b"JGC1",
+    ("rgb", "fisheye"): b"JRE1",
+    ("grey", "fisheye"): b"JGE1",
 }
 """The same where a JPEG file follows the header in place of pixels."""
 
@@ -75,8 +81,8 @@ class Frame:
     """Simulated time of the exposure [µs]."""
     image: NDArray[Any]
     """Of depth uint16 (height, width), RealSense Z16 convention [mm]; 0 = no return. Along the
-    optical axis of a pinhole, in the camera's horizontal plane of a cylinder. Of colour uint8
-    (height, width, 3) sRGB, or (height, width, 1) grey."""
+    optical axis of a pinhole, in the camera's horizontal plane of a cylinder, along the ray of a
+    fisheye. Of colour uint8 (height, width, 3) sRGB, or (height, width, 1) grey."""
     intrinsics: Intrinsics
     """Of its camera; its `kind` says what the pixels are."""
     jpeg: bytes | None = None

@@ -16,10 +16,12 @@ from airl_mav.camera.intrinsics import Intrinsics
 Light = NDArray[np.float32]
 """(h, w) or (h, w, channels), linear."""
 
-LIGHT_OF: Final[Light] = linear_of(np.linspace(0.0, 1.0, 256)).astype(np.float32)
+_NUMBERS = np.arange(256, dtype=np.float64)
+
+LIGHT_OF: Final[Light] = linear_of(_NUMBERS / 255.0).astype(np.float32)
 """(256,) the light of each sRGB number."""
 
-_EDGES: Final[Light] = linear_of((np.arange(255) + 0.5) / 255.0).astype(np.float32)
+_EDGES: Final[Light] = linear_of((_NUMBERS[:-1] + 0.5) / 255.0).astype(np.float32)
 """(255,) light from which on each number but 0 is the nearest."""
 
 

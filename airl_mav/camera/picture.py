@@ -13,6 +13,7 @@ from airl_mav.arena.appearance import TEXTURES, Drawn, linear_of, srgb_of
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.bvh import meshes_of
 from airl_mav.camera.colour import Work, render_colour
+from airl_mav.camera.fisheye import bent_of, check_meshes
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.textures import PERIOD, atlas, means
 from airl_mav.core.kernels import kernel
@@ -75,8 +76,9 @@ def render_picture(
     Depth has no limit of range. All light is times `gain`, before it becomes numbers.
 
     Raises:
-        UsageError: The file of a mesh cannot be read, or is another one.
+        UsageError: The file of a mesh cannot be read, or is another one; a fisheye looks at one.
     """
+    check_meshes(intrinsics, arena)
     k, obstacles, look = intrinsics, arena.obstacles, ColourArrays.of(arena.look)
     shape = (k.height, k.width)
     # Tuples and arrays of the types that the batch twin hands over: one compiled kernel for both.
@@ -107,6 +109,7 @@ def render_picture(
         look.albedo,
         lights,
         atlas(),
+        bent_of(k),
     )
     return picture
 

@@ -11,9 +11,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.camera.fisheye import bent_of
 from airl_mav.camera.frame import MAX_MM, MM_PER_M
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.noise import DepthNoise, noise_of, noisy_frame
+from airl_mav.camera.projection import Bent
 from airl_mav.camera.raycast import render_depth
 from airl_mav.camera.render import Mount, camera_pose
 from airl_mav.core.constants import TICK_US, US_PER_S
@@ -48,12 +50,14 @@ class Lens(NamedTuple):
     """Greatest depth that gives a return [m]."""
     cylindrical: bool = False
     """The image is a cylinder's."""
+    bent: Bent | None = None
+    """The rays of a fisheye."""
 
 
 def lens_of(intrinsics: Intrinsics, range_m: float) -> Lens:
     """Return the lens of a camera that sees `range_m` [m] far."""
     k = intrinsics
-    return Lens(k.focal, k.cx, k.cy, range_m, k.cylindrical)
+    return Lens(k.focal, k.cx, k.cy, range_m, k.cylindrical, bent_of(k))
 
 
 class Cameras(Stateful):
@@ -303,6 +307,7 @@ def render_images(
             arenas.half_size[i, :count],
             arenas.yaw[i, :count],
             None if meshes is None else meshes_in(meshes, i, count),
+            lens.bent,
         )
         _to_z16(image, out[i])
 

@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 from airl_mav.arena.appearance import OBSTACLE
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.colour import Work, render_colour
+from airl_mav.camera.fisheye import bent_of
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.picture import ColourArrays, write_grey
+from airl_mav.camera.projection import Bent
 from airl_mav.camera.render import Mount, camera_pose
 from airl_mav.camera.textures import atlas
 from airl_mav.core.kernels import kernel
@@ -80,7 +82,7 @@ class ColourImages:
     ) -> None:
         """Take the camera, its place on the body, how the arenas look, and their meshes."""
         k = intrinsics
-        self._lens = (k.focal, k.cx, k.cy, k.cylindrical)
+        self._lens, self._bent = (k.focal, k.cx, k.cy, k.cylindrical), bent_of(k)
         self._mount, self._looks, self._meshes = mount, looks, meshes
         self._work = Work.of(k.width, k.height, k.cylindrical)
         shape = (k.height, k.width)
@@ -102,6 +104,7 @@ class ColourImages:
             *self._lens,
             *room,
             atlas(),
+            self._bent,
             out,
         )
 
@@ -123,6 +126,7 @@ def render_colour_images(
     depth: NDArray[np.float32],
     seen: NDArray[np.int32],
     patterns: NDArray[np.float32],
+    bent: Bent | None,
     out: NDArray[np.uint8],
 ) -> None:
     """Render the colour image of every vehicle in `who`, from where it is now.
@@ -143,6 +147,7 @@ def render_colour_images(
         depth: (h, w).
         seen: (h, w).
         patterns: `textures.atlas()`.
+        bent: `fisheye.bent_of` the camera.
         out: (n, h, w, channels) sRGB, or grey where there is one channel, written.
     """
     grey = out.shape[3] == 1
@@ -177,6 +182,7 @@ def render_colour_images(
             looks.albedo[i, :surfaces],
             looks.lights[i],
             patterns,
+            bent,
         )
         if grey:
             pixels = rgb.shape[0] * rgb.shape[1]

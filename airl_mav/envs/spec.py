@@ -65,7 +65,9 @@ class CameraChange(ProfileModel):
     width_px: int | None = quantity("image width", "px", ge=8, le=640, default=None)
     height_px: int | None = quantity("image height", "px", ge=6, le=480, default=None)
     projection: Projection | None = Field(
-        default=None, description="pinhole, or cylindrical for a field of view of up to 360 deg"
+        default=None,
+        description="pinhole, cylindrical for a field of view of up to 360 deg, or fisheye of up to"
+        " 190 deg",
     )
     horizontal_fov_deg: float | None = quantity(
         "horizontal field of view, less than 170 with a pinhole",

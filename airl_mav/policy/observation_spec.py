@@ -63,8 +63,8 @@ class ObservationSpec(ProfileModel):
     width_px: int = quantity("width of the image that the network sees", "px", ge=4, le=640)
     projection: Projection = Field(
         default="pinhole",
-        description="how directions fall on the image: pinhole, or cylindrical for a field of view"
-        " of up to 360 deg",
+        description="how directions fall on the image: pinhole, cylindrical for a field of view of"
+        " up to 360 deg, or fisheye (equidistant) of up to 190 deg",
     )
     horizontal_fov_deg: float = quantity(
         "horizontal field of view, less than 170 with a pinhole",
@@ -109,6 +109,10 @@ class ObservationSpec(ProfileModel):
             raise ValueError(f"frames = {self.frames}: accepted: 1 with layout 'paper'")
         if self.kind != "depth" and self.layout in ("paper", "scan"):
             raise ValueError(f"kind = {self.kind!r}: accepted: 'depth' with layout {self.layout!r}")
+        if self.projection == "fisheye" and self.layout == "scan":
+            raise ValueError(
+                "projection = 'fisheye': accepted: pinhole or cylindrical with layout 'scan'"
+            )
         if self.goal_height and self.layout == "paper":
             raise ValueError("goal_height = true: accepted: false with layout 'paper'")
         check_fov("horizontal_fov_deg", self.projection, self.horizontal_fov_deg)

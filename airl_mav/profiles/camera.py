@@ -38,7 +38,8 @@ class Camera(ProfileModel):
     )
     projection: Projection = Field(
         default="pinhole",
-        description="pinhole, or cylindrical for a field of view of up to 360 deg",
+        description="pinhole, cylindrical for a field of view of up to 360 deg, or fisheye"
+        " (equidistant) of up to 190 deg",
     )
     width_px: int = quantity("image width", "px", ge=8, le=640)
     height_px: int = quantity("image height", "px", ge=6, le=480)
