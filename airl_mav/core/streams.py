@@ -25,6 +25,7 @@ class Stream(IntEnum):
     APPEARANCE = 19
     PHOTONS = 20
     EXPOSURE = 21
+    RANGING = 22
 
 
 def stream(seed: int, name: Stream, *more: int) -> np.random.Generator:

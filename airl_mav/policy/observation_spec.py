@@ -33,6 +33,9 @@ SEAM_SHARE = 8
 """`scan`: so many-th of the bearings of a camera that sees all round are repeated at either end, so
 that a convolution sees what is behind the vehicle in one piece."""
 
+LEAST_ROWS = 4
+"""Of an image that goes into a network: all but a scan's, which is a row for each frame."""
+
 MOST_FRAMES = 8
 """Most images that a network sees at a time."""
 
@@ -59,7 +62,12 @@ class ObservationSpec(ProfileModel):
     """What a network takes, and the camera that can provide it."""
 
     layout: LayoutName = Field(default="body", description="which arrays it takes")
-    height_px: int = quantity("height of the image that the network sees", "px", ge=4, le=480)
+    height_px: int = quantity(
+        "height of the image that the network sees; less than 4 only with layout scan",
+        "px",
+        ge=1,
+        le=480,
+    )
     width_px: int = quantity("width of the image that the network sees", "px", ge=4, le=640)
     projection: Projection = Field(
         default="pinhole",
@@ -104,6 +112,11 @@ class ObservationSpec(ProfileModel):
             raise ValueError(
                 f"height_px = {self.height_px}: accepted: more than {STRIP_ROWS}, the rows of "
                 "the strip of layout 'paper'"
+            )
+        if self.height_px < LEAST_ROWS and self.layout in SHIPPED and self.layout != "scan":
+            raise ValueError(
+                f"height_px = {self.height_px}: accepted: {LEAST_ROWS} or more with layout"
+                f" {self.layout!r}"
             )
         if self.frames > 1 and self.layout == "paper":
             raise ValueError(f"frames = {self.frames}: accepted: 1 with layout 'paper'")

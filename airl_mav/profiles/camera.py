@@ -13,6 +13,9 @@ from airl_mav.profiles.camera_kind import CameraKind
 from airl_mav.profiles.imaging import Imaging
 from airl_mav.profiles.projection import CYLINDER_MOST_DEG, Projection, check_fov
 
+LEAST_ROWS = 6
+"""Of an image that is no cylinder's."""
+
 
 class Stereo(ProfileModel):
     """How a depth camera matches the images of two imagers; see `camera.stereo`."""
@@ -26,6 +29,23 @@ class Stereo(ProfileModel):
     most_px: float = quantity(
         "greatest disparity that is searched: sets the least depth", "px", ge=1, le=1000
     )
+
+
+class Ranging(ProfileModel):
+    """How a lidar or another sensor of ranges measures them; see `camera.noise`."""
+
+    noise_m: float = quantity("noise of a range, sd", "m", ge=0, le=5, default=0.0)
+    noise_share: float = quantity(
+        "noise that grows with the range, sd as a share of it", "1", ge=0, le=0.5, default=0.0
+    )
+    lost_share: float = quantity(
+        "share of returns that are lost, drawn anew with every image",
+        "1",
+        ge=0,
+        le=0.9,
+        default=0.0,
+    )
+    least_m: float = quantity("least depth that gives a return", "m", ge=0, le=10, default=0.0)
 
 
 class Camera(ProfileModel):
@@ -42,7 +62,12 @@ class Camera(ProfileModel):
         " (equidistant) of up to 190 deg",
     )
     width_px: int = quantity("image width", "px", ge=8, le=640)
-    height_px: int = quantity("image height", "px", ge=6, le=480)
+    height_px: int = quantity(
+        "image height; less than 6, down to the one row of a planar lidar, only of a cylinder",
+        "px",
+        ge=1,
+        le=480,
+    )
     horizontal_fov_deg: float = quantity(
         "horizontal field of view, less than 170 with a pinhole",
         "deg",
@@ -61,6 +86,10 @@ class Camera(ProfileModel):
         description="how depth is matched, of a depth camera with a pinhole; left out: depth"
         " without error",
     )
+    ranging: Ranging | None = Field(
+        default=None,
+        description="how a lidar measures depth; left out: without error",
+    )
     imaging: Imaging | None = Field(
         default=None,
         description="how the image of an rgb or grey camera is formed; left out: as the ray caster"
@@ -70,6 +99,7 @@ class Camera(ProfileModel):
     @model_validator(mode="after")
     def _projects(self) -> Camera:
         check_fov("camera.horizontal_fov_deg", self.projection, self.horizontal_fov_deg)
+        check_rows("camera.height_px", self)
         if self.stereo is not None and self.projection != "pinhole":
             raise FieldError(
                 "camera.stereo", self.projection, "left out where the projection is not pinhole"
@@ -89,6 +119,8 @@ class Camera(ProfileModel):
             data.pop("projection", None)
         if self.stereo is None:
             data.pop("stereo", None)
+        if self.ranging is None:
+            data.pop("ranging", None)
         if self.imaging is None:
             data.pop("imaging", None)
         return data
@@ -107,10 +139,22 @@ def check_matched(field: str, camera: Camera) -> None:
             camera.kind,
             problem="with a table camera.imaging; accepted: rgb or grey with one",
         )
+    if camera.ranging is not None and (camera.kind != "depth" or camera.stereo is not None):
+        problem = (
+            "with a table camera.ranging; accepted: 'depth' with one, and without camera.stereo"
+        )
+        raise FieldError(field, camera.kind, problem=problem)
     if camera.stereo is not None and camera.kind != "depth":
         raise FieldError(
             field, camera.kind, problem="with a table camera.stereo; accepted: 'depth' with one"
         )
+
+
+def check_rows(field: str, camera: Camera) -> None:
+    """Raise FieldError, naming the field, for an image that is too low for its projection."""
+    if camera.height_px < LEAST_ROWS and camera.projection != "cylindrical":
+        accepted = f"value >= {LEAST_ROWS} px with projection {camera.projection!r}"
+        raise FieldError(field, camera.height_px, accepted)
 
 
 def _check_imaging(imaging: Imaging, camera: Camera) -> None:
