@@ -57,7 +57,7 @@ def colour_all(
         render_colour(
             rgb, depth, seen, work, (p[0], p[1], p[2]), (q[0], q[1], q[2], q[3]), focal, cx, cy,
             False, bounds, shape, center, half, yaw, meshes, texture, per_m, offset, albedo, lights,
-            patterns,
+            patterns, None,
         )  # fmt: skip
 
 

@@ -91,6 +91,7 @@ def render_all(
             half,
             yaw,
             meshes,
+            None,
         )
 
 

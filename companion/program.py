@@ -95,6 +95,9 @@ def prepare(asked: StandAloneCompanion) -> Mission:
     if asked.tell_obstacles and vehicle.camera.kind != "depth":
         accepted = "with a vehicle whose camera gives depth"
         raise FieldError("tell_obstacles", asked.tell_obstacles, accepted)
+    if asked.tell_obstacles and vehicle.camera.projection == "fisheye":
+        accepted = "with a vehicle whose camera is a pinhole or a cylinder"
+        raise FieldError("tell_obstacles", asked.tell_obstacles, accepted)
     # What its card says is held against the camera's first frame, before take-off.
     if policy.card is None and (reason := camera_refused(policy, vehicle.camera)):
         raise FieldError(

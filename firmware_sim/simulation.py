@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.frame import Frame
+from airl_mav.camera.render import Motion
 from airl_mav.core.clock import Clock
 from airl_mav.core.streams import Stream, stream
 from airl_mav.profiles.vehicle import VehicleProfile
@@ -27,7 +28,7 @@ from firmware_sim.faults.timeline import FaultTimeline
 from firmware_sim.flight_controller import FlightController
 from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth
 from firmware_sim.plant.camera_server import SimulatedCamera
-from firmware_sim.plant.kinematics import POSITION, QUATERNION
+from firmware_sim.plant.kinematics import POSITION, QUATERNION, RATES, VELOCITY
 from firmware_sim.plant.plant import Plant
 from firmware_sim.recording import FlightRecorder, fault_arrays
 
@@ -184,8 +185,9 @@ class Simulation:
         """Hand a depth frame to `publish` when the camera is due; an endless floor has none."""
         camera = self._camera
         if camera is not None and self.time_us >= camera.next_us:
-            motion = self.plant.motion
-            camera.offer(self.time_us, motion[POSITION], motion[QUATERNION], publish)
+            row = self.plant.motion
+            motion = Motion(row[POSITION], row[QUATERNION], row[VELOCITY], row[RATES])
+            camera.offer(self.time_us, motion, publish)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return what was recorded so far, by the names of its file (docs/run-folder.md)."""

@@ -198,6 +198,7 @@ LENSES = (
     Intrinsics.from_fov(16, 12, 2.0 * math.pi, "cylindrical"),
     Intrinsics.from_fov(16, 12, math.pi / 2, kind="rgb"),
     Intrinsics.from_fov(16, 12, 2.0 * math.pi, "cylindrical", "grey"),
+    Intrinsics.from_fov(16, 12, math.pi, "fisheye"),
 )
 STAMPS = (0, 1, -1, 2**63 - 1, -(2**63), US_PER_S, 10**15)
 NUMBERS = (0.0, -1.0, 1e-320, 1e308, math.nan, math.inf, -math.inf, 8.0)

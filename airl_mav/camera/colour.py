@@ -18,9 +18,9 @@ from airl_mav.arena.appearance import WALLS as WALLS_ROW
 from airl_mav.camera.bvh import Meshes, is_owned
 from airl_mav.camera.mesh_shadows import shade_by_meshes
 from airl_mav.camera.mesh_surfaces import shade_meshes
-from airl_mav.camera.primitives import OBSTACLE, Ids
-from airl_mav.camera.projection import MIN_DEPTH_M, Pose
-from airl_mav.camera.raycast import aim, draw_bodies, invert
+from airl_mav.camera.primitives import OBSTACLE, SKY, Ids
+from airl_mav.camera.projection import MIN_DEPTH_M, Bent, Pose
+from airl_mav.camera.raycast import aim, blank, draw_bodies, invert
 from airl_mav.camera.shading import F32, ZERO, Lit, Packed, Plane, Points, Rays, surface_of
 from airl_mav.camera.shadows import CORNERS, shade_by_obstacle, shade_by_walls
 from airl_mav.camera.surfaces import (
@@ -99,6 +99,7 @@ def render_colour(
     albedo: NDArray[np.float32],
     lights: NDArray[np.float32],
     atlas: Plane,
+    bent: Bent | None,
 ) -> None:
     """Render the colour image of an arena.
 
@@ -128,6 +129,7 @@ def render_colour(
         lights: (7, 3) direction of the sun, its irradiance, that of the sky, the floor's mean
             radiosity, zenith, horizon; then the fog's extinction [1/m] in the first column.
         atlas: `textures.atlas()`.
+        bent: As of `render_depth`.
     """
     camera = (position[0], position[1], min(position[2], -MIN_DEPTH_M))
     lines, xs = work.lines, work.xs
@@ -136,18 +138,23 @@ def render_colour(
     rectangles = np.zeros((len(shape), 3, 4), np.int32)
     faces = None if meshes is None else np.empty(far.shape, np.int32)
     inside = draw_bodies(
-        far, ids, rectangles, lines, xs, view, axes, camera, bounds, shape, center, half_size, yaw,
-        meshes, faces,
+        far, ids, rectangles, lines, xs, bent, view, axes, camera, bounds, shape, center, half_size,
+        yaw, meshes, faces,
     )  # fmt: skip
     if inside >= 0:
         rgb[:, :, :] = 0
         depth[:, :] = MIN_DEPTH_M
         seen[:, :] = OBSTACLE + inside
+        if bent is not None:
+            blank(depth, bent)
+            for v in range(depth.shape[0]):
+                for u in range(depth.shape[1]):
+                    seen[v, u] = seen[v, u] if depth[v, u] > ZERO else SKY
         return
     invert(far)
     light = _lit(lights)
     lit, clear, out, points, rays = work.lit, work.clear, work.out, work.points, work.rays
-    write_rays(rays, lines, xs, axes)
+    write_rays(rays, lines, xs, bent, axes)
     to_sun = (float(lights[0, 0]), float(lights[0, 1]), float(lights[0, 2]))
     all_ids, all_far, all_lit, all_clear = ids.ravel(), far.ravel(), lit.ravel(), clear.ravel()
     extinction = float(light.extinction)
@@ -159,8 +166,8 @@ def render_colour(
                 continue
             world, half = _placed(axes, camera, center, half_size, i)
             shade_by_obstacle(
-                lit, far, ids, work.corners, i, lines, xs, view, world, camera, shape[i], half,
-                yaw[i], to_sun,
+                lit, far, ids, work.corners, i, lines, xs, bent, view, world, camera, shape[i],
+                half, yaw[i], to_sun,
             )  # fmt: skip
     if meshes is not None and faces is not None and sunny:
         shade_by_meshes(
@@ -189,12 +196,25 @@ def render_colour(
         for k in range(3 if cylindrical else 1):
             shade_obstacle(
                 out, all_ids, all_far, all_lit, all_clear, points, rectangles[i, k], i, lines, xs,
-                world, shape[i], half, yaw[i], surface, light, atlas, pixel2,
+                bent, world, shape[i], half, yaw[i], surface, light, atlas, pixel2,
             )  # fmt: skip
+    if bent is not None:
+        _blacken(out, bent)
     _unpack(rgb, out, cylindrical)
     if cylindrical:
         depth[:, :] = far.T
         seen[:, :] = ids.T
+
+
+@kernel
+def _blacken(out: Packed, bent: Bent) -> None:
+    """Write black where a fisheye's pixels see nothing at all."""
+    n, m = bent.forward.shape
+    for v in range(n):
+        for u in range(m):
+            i, j, k = bent.forward[v, u], bent.across[v, u], bent.along[v, u]
+            if i == 0.0 and j == 0.0 and k == 0.0:
+                out[v * m + u] = np.int32(0)
 
 
 @kernel

@@ -48,6 +48,8 @@ def check_renderer(camera: Camera, renderer: Renderer, arena: ArenaSpec) -> None
     accepted = None
     if camera.kind == "depth":
         accepted = "raycast with a depth camera; mitsuba draws colour"
+    elif camera.imaging is not None:
+        accepted = "raycast with a camera that has a table imaging"
     elif camera.projection != "pinhole":
         accepted = f"raycast with a {camera.projection} camera"
     elif arena.appearance.fog.drawn:
@@ -56,3 +58,14 @@ def check_renderer(camera: Camera, renderer: Renderer, arena: ArenaSpec) -> None
         accepted = "raycast: mitsuba is not installed (pip install 'airl-mav[render]')"
     if accepted is not None:
         raise FieldError("renderer", renderer, accepted)
+
+
+def check_twin_imaging(camera: Camera) -> None:
+    """Raise FieldError for a gain that takes time, where only decisions take frames."""
+    auto = None if camera.imaging is None else camera.imaging.auto_exposure
+    if auto is not None and auto.time_constant_s > 0.0:
+        raise FieldError(
+            "camera.imaging.auto_exposure.time_constant_s",
+            auto.time_constant_s,
+            "0 in the batch twin, which takes the frames of decisions alone; any in lockstep",
+        )

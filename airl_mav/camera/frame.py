@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.jpeg import image_of
 from airl_mav.core.errors import UsageError
 from airl_mav.profiles.camera_kind import CameraKind, shape_of
 from airl_mav.profiles.projection import Projection
@@ -22,10 +23,25 @@ MAGICS: dict[tuple[CameraKind, Projection], bytes] = {
     ("rgb", "cylindrical"): b"ARC1",
     ("grey", "pinhole"): b"AGF1",
     ("grey", "cylindrical"): b"AGC1",
+    ("depth", "fisheye"): b"ADE1",
+    ("rgb", "fisheye"): b"ARE1",
+    ("grey", "fisheye"): b"AGE1",
 }
-"""How a frame begins: air-learning depth, RGB or grey, frame or cylinder, version 1."""
+"""How a frame begins: air-learning depth, RGB or grey; frame, cylinder, or equidistant fisheye;
+version 1."""
+
+JPEG_MAGICS: dict[tuple[CameraKind, Projection], bytes] = {
+    ("rgb", "pinhole"): b"JRF1",
+    ("rgb", "cylindrical"): b"JRC1",
+    ("grey", "pinhole"): b"JGF1",
+    ("grey", "cylindrical"): b"JGC1",
+    ("rgb", "fisheye"): b"JRE1",
+    ("grey", "fisheye"): b"JGE1",
+}
+"""The same where a JPEG file follows the header in place of pixels."""
 
 _CAMERA_OF = {magic: camera for camera, magic in MAGICS.items()}
+_JPEG_CAMERA_OF = {magic: camera for camera, magic in JPEG_MAGICS.items()}
 
 _PIXELS: dict[CameraKind, tuple[str, int]] = {
     "depth": ("<u2", 2),
@@ -65,10 +81,12 @@ class Frame:
     """Simulated time of the exposure [µs]."""
     image: NDArray[Any]
     """Of depth uint16 (height, width), RealSense Z16 convention [mm]; 0 = no return. Along the
-    optical axis of a pinhole, in the camera's horizontal plane of a cylinder. Of colour uint8
-    (height, width, 3) sRGB, or (height, width, 1) grey."""
+    optical axis of a pinhole, in the camera's horizontal plane of a cylinder, along the ray of a
+    fisheye. Of colour uint8 (height, width, 3) sRGB, or (height, width, 1) grey."""
     intrinsics: Intrinsics
     """Of its camera; its `kind` says what the pixels are."""
+    jpeg: bytes | None = None
+    """The JPEG file that `image` was decoded from; None: it was never compressed."""
 
     @property
     def depth_mm(self) -> NDArray[np.uint16]:
@@ -83,10 +101,12 @@ class Frame:
         """Return the wire form."""
         k = self.intrinsics
         header = _HEADER.pack(
-            MAGICS[k.kind, k.projection],
+            (MAGICS if self.jpeg is None else JPEG_MAGICS)[k.kind, k.projection],
             *(self.sequence, self.capture_time_us),
             *(k.width, k.height, k.focal, k.cx, k.cy),
         )
+        if self.jpeg is not None:
+            return header + self.jpeg
         return header + self.image.astype(_PIXELS[k.kind][0], copy=False).tobytes()
 
     @classmethod
@@ -95,18 +115,20 @@ class Frame:
 
         Raises FrameError for anything else, also for what no camera takes: an image without pixels
         or with too many, a focal length or a centre out of bounds, or not a number, a cylinder of
-        more than a turn.
+        more than a turn, a damaged JPEG or one of another size. Raises UsageError for a JPEG where
+        Pillow is not installed.
         """
         if len(data) < _HEADER.size:
             raise FrameError(f"{len(data)} bytes are too short for a frame header")
         magic, sequence, time_us, width, height, focal, cx, cy = _HEADER.unpack_from(data)
-        camera = _CAMERA_OF.get(magic)
+        camera = _CAMERA_OF.get(magic) or _JPEG_CAMERA_OF.get(magic)
         if camera is None:
-            known = " or ".join(repr(each) for each in _CAMERA_OF)
+            known = " or ".join(repr(each) for each in (*_CAMERA_OF, *_JPEG_CAMERA_OF))
             raise FrameError(f"magic {magic!r}, expected {known}")
         kind, projection = camera
         number, size = _PIXELS[kind]
-        if len(data) != _HEADER.size + size * width * height:
+        compressed = magic in _JPEG_CAMERA_OF
+        if not compressed and len(data) != _HEADER.size + size * width * height:
             raise FrameError(f"{len(data)} bytes do not hold {width}x{height} pixels of {kind}")
         if not 0 < width * height <= MOST_PIXELS:
             raise FrameError(f"{width}x{height} pixels: accepted: 1..{MOST_PIXELS}")
@@ -115,8 +137,15 @@ class Frame:
             raise FrameError(f"focal {focal}, centre {cx}, {cy}: no {projection} camera")
         if projection == "cylindrical" and width > _TURN * 2.0 * math.pi * focal:
             raise FrameError(f"focal {focal}, {width} px wide: a cylinder of more than one turn")
-        pixels = np.frombuffer(data, number, offset=_HEADER.size)
         lens = Intrinsics(width, height, focal, cx, cy, projection, kind)
+        if compressed:
+            jpeg = data[_HEADER.size :]
+            try:
+                decoded = image_of(jpeg, height, width, size)
+            except ValueError as error:
+                raise FrameError(str(error)) from None
+            return cls(sequence, time_us, decoded, lens, jpeg)
+        pixels = np.frombuffer(data, number, offset=_HEADER.size)
         return cls(sequence, time_us, pixels.reshape(shape_of(kind, height, width)), lens)
 
 

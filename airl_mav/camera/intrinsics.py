@@ -1,4 +1,4 @@
-"""The two models of a camera, a pinhole and a cylinder that sees all round; what its pixels are."""
+"""The models of a camera: a pinhole, a cylinder that sees all round, a fisheye; and its pixels."""
 
 from __future__ import annotations
 
@@ -29,14 +29,17 @@ class Intrinsics:
       from above. Depth is measured in the camera's horizontal plane, perpendicular to the axis of
       the cylinder. Upright edges are upright in the image, and the column of the optical axis is
       that of a pinhole of the same focal length.
+    - fisheye, equidistant: (sin b cos c, sin b sin c, cos b), at the angle b = r / focal [rad] from
+      the optical axis, where r is the way from (cx, cy) to the pixel and c its direction. Depth is
+      measured along that unit vector. Pixels more than 95 degrees from the axis see nothing.
 
-    Both times depth is the factor of that vector which leads to the point that is seen.
+    In all of them depth is the factor of that vector which leads to the point that is seen.
     """
 
     width: int
     height: int
     focal: float
-    """Focal length [px] of a pinhole, columns for an angle [px/rad] of a cylinder."""
+    """Focal length [px] of a pinhole, pixels for an angle [px/rad] of a cylinder and a fisheye."""
     cx: float
     cy: float
     projection: Projection = "pinhole"
@@ -53,9 +56,9 @@ class Intrinsics:
     ) -> Intrinsics:
         """Return the intrinsics of a camera with a horizontal field of view [rad].
 
-        It is in (0, pi) for a pinhole, in (0, 2 pi] for a cylinder.
+        It is in (0, pi) for a pinhole, in (0, 2 pi] for a cylinder, to 190 degrees for a fisheye.
         """
-        if projection == "cylindrical":
+        if projection != "pinhole":
             focal = width / horizontal_fov
         else:
             focal = 0.5 * width / math.tan(0.5 * horizontal_fov)
@@ -90,6 +93,6 @@ class Intrinsics:
     @property
     def horizontal_fov_rad(self) -> float:
         """Horizontal field of view [rad], from edge to edge of the image."""
-        if self.cylindrical:
+        if self.projection != "pinhole":
             return self.width / self.focal
         return 2.0 * math.atan2(0.5 * self.width, self.focal)

@@ -80,8 +80,10 @@ class PathTracer:
         seed: int,
     ) -> NDArray[np.uint8]:
         """Return the image; see `path_traced`."""
-        if intrinsics.cylindrical:
-            raise UsageError("renderer mitsuba: accepted: a pinhole camera, not a cylindrical one")
+        if intrinsics.projection != "pinhole":
+            raise UsageError(
+                f"renderer mitsuba: accepted: a pinhole camera, not a {intrinsics.projection} one"
+            )
         if arena.look.light.extinction > 0.0:
             raise UsageError("renderer mitsuba: accepted: an arena without appearance.fog")
         import mitsuba as mi

@@ -1,4 +1,4 @@
-"""What makes a depth camera's images differ from the truth: its own matching, and conditions."""
+"""What makes a depth camera's images differ from the truth: how it measures, and conditions."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from airl_mav.camera.frame import MAX_MM, MM_PER_M
 from airl_mav.camera.stereo import Matching, matched_depth, matching_of
 from airl_mav.core.streams import Stream, stream
-from airl_mav.profiles.camera import Camera
+from airl_mav.profiles.camera import Camera, Ranging
 from airl_mav.profiles.conditions import SensorNoise
 
 NOISE_AT_M = 10.0
@@ -23,13 +23,20 @@ class DepthNoise(NamedTuple):
     matching: Matching | None
     """That of a stereo camera; None: none."""
     asked: SensorNoise
+    ranging: Ranging | None = None
+    """That of a lidar; None: none."""
+    range_m: float = 0.0
+    """Greatest depth of a lidar's return [m]."""
 
 
 def noise_of(camera: Camera, asked: SensorNoise) -> DepthNoise | None:
     """Return what happens to the images of a camera; None: nothing."""
     matching = matching_of(camera, asked.stereo_noise)
-    changed = matching is not None or asked.depth_noise or asked.depth_dropout
-    return DepthNoise(matching, asked) if changed else None
+    ranging = camera.ranging
+    changed = matching is not None or ranging is not None
+    if not (changed or asked.depth_noise or asked.depth_dropout):
+        return None
+    return DepthNoise(matching, asked, ranging, camera.range_m)
 
 
 def noisy_frame(
@@ -46,9 +53,33 @@ def noisy_frame(
     """
     if noise.matching is not None:
         depth_mm = matched_depth(depth_mm, noise.matching, stream(seed, Stream.STEREO, frame))
+    if noise.ranging is not None:
+        rng = stream(seed, Stream.RANGING, frame)
+        depth_mm = ranged_depth(depth_mm, noise.ranging, noise.range_m, rng)
     if noise.asked.depth_noise or noise.asked.depth_dropout:
         depth_mm = noisy_depth(depth_mm, noise.asked, stream(seed, Stream.DEPTH, frame))
     return depth_mm
+
+
+def ranged_depth(
+    depth_mm: NDArray[np.uint16], ranging: Ranging, range_m: float, rng: np.random.Generator
+) -> NDArray[np.uint16]:
+    """Return a true Z16 image (h, w) as a lidar measures it; 0 = no return.
+
+    Args:
+        depth_mm: The image.
+        ranging: How it measures.
+        range_m: Greatest depth that gives a return [m].
+        rng: What draws.
+    """
+    depth = depth_mm / MM_PER_M
+    sd = np.hypot(ranging.noise_m, ranging.noise_share * depth)
+    measured = depth + sd * rng.standard_normal(depth.shape)
+    kept = (depth_mm > 0) & (rng.random(depth.shape) >= ranging.lost_share)
+    kept &= (measured >= ranging.least_m) & (measured <= range_m)
+    in_mm = np.clip(np.rint(MM_PER_M * measured), 1, MAX_MM)
+    result: NDArray[np.uint16] = np.where(kept, in_mm, 0).astype(np.uint16)
+    return result
 
 
 def noisy_depth(

@@ -13,6 +13,7 @@ from airl_mav.arena.appearance import Drawn, linear_of, srgb_of
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.bvh import meshes_of
 from airl_mav.camera.colour import Work, render_colour
+from airl_mav.camera.fisheye import bent_of, check_meshes
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.textures import atlas, mean_of, periods
 from airl_mav.core.kernels import kernel
@@ -69,19 +70,22 @@ def render_picture(
     intrinsics: Intrinsics,
     position: Vec | NDArray[np.float64],
     quaternion: Quat | NDArray[np.float64],
+    gain: float = 1.0,
 ) -> Picture:
     """Return the colour image of an arena, with depth and what is seen; arguments as of `render`.
 
-    Depth has no limit of range.
+    Depth has no limit of range. All light is times `gain`, before it becomes numbers.
 
     Raises:
-        UsageError: The file of a mesh cannot be read, or is another one.
+        UsageError: The file of a mesh cannot be read, or is another one; a fisheye looks at one.
     """
+    check_meshes(intrinsics, arena)
     k, obstacles, look = intrinsics, arena.obstacles, ColourArrays.of(arena.look)
     shape = (k.height, k.width)
     # Tuples and arrays of the types that the batch twin hands over: one compiled kernel for both.
     north, east, down = (float(part) for part in position)
     q0, q1, q2, q3 = (float(part) for part in quaternion)
+    lights = look.lights if gain == 1.0 else _brightened(look.lights, gain)
     picture = Picture(
         np.empty((*shape, 3), np.uint8), np.empty(shape, np.float32), np.empty(shape, np.int32)
     )
@@ -104,10 +108,18 @@ def render_picture(
         look.per_m,
         look.offset,
         look.albedo,
-        look.lights,
+        lights,
         atlas(arena.look.finish.images),
+        bent_of(k),
     )
     return picture
+
+
+def _brightened(lights: NDArray[np.float32], gain: float) -> NDArray[np.float32]:
+    """Return the lights (7, 3) of `ColourArrays` times a gain: neither direction nor fog."""
+    brighter = lights.copy()
+    brighter[1:6] *= np.float32(gain)
+    return brighter
 
 
 def grey(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Shape
-from airl_mav.camera.projection import Image, Pose, Rectangle, View, dot
+from airl_mav.camera.projection import Bent, Image, Pose, Rectangle, View, dot, ray_of
 from airl_mav.core.kernels import kernel
 from airl_mav.vehicle.rotation import Vec
 
@@ -78,6 +78,7 @@ def draw_room(
     ids: Ids | None,
     lines: Lines,
     xs: Line,
+    bent: Bent | None,
     view: View,
     pose: Pose,
     half: Vec,
@@ -89,7 +90,7 @@ def draw_room(
     one that enters by the lid sees the inside, any other that enters sees a wall from outside.
     Where it is closed, either sees the lid.
     """
-    c, r = pose.center, pose.along
+    c = pose.center
     north = _slab(c[0] - half[0], c[0] + half[0])
     east = _slab(c[1] - half[1], c[1] + half[1])
     floor, top = 1.0 / (c[2] + half[2]), c[2] - half[2]
@@ -98,13 +99,12 @@ def draw_room(
     enter_gain, enter_base, exit_gain = (lid, 0.0, 0.0) if above else (0.0, _UNLIMITED, lid)
     covered, lid_seen = closed and above, 1.0 if closed else 0.0
     for v in range(out.shape[0]):
-        d0, d1, d2 = _line_start(pose, lines[v, 0], lines[v, 1])
+        start = _line_start(pose, lines[v, 0], lines[v, 1])
         row = out[v]
         if ids is not None:
             marks = ids[v]
         for u in range(len(xs)):
-            x = xs[u]
-            n, e, d = d0 + x * r[0], d1 + x * r[1], d2 + x * r[2]
+            n, e, d = ray_of(pose, bent, v, u, start, xs[u])
             by_side = min(
                 north.enter_gain * n + north.enter_base, east.enter_gain * e + east.enter_base
             )
@@ -142,13 +142,14 @@ def draw_box(
     number: int,
     lines: Lines,
     xs: Line,
+    bent: Bent | None,
     view: View,
     pose: Pose,
     half: Vec,
     rectangle: Rectangle,
 ) -> bool:
     """Draw a box; return whether the camera is inside."""
-    c, r = pose.center, pose.along
+    c = pose.center
     i = _slab(c[0] - half[0], c[0] + half[0])
     j = _slab(c[1] - half[1], c[1] + half[1])
     k = _slab(c[2] - half[2], c[2] + half[2])
@@ -157,13 +158,12 @@ def draw_box(
     top, bottom, left, end = rectangle
     x_span = xs[left:end]
     for v in range(top, bottom):
-        d0, d1, d2 = _line_start(pose, lines[v, 0], lines[v, 1])
+        start = _line_start(pose, lines[v, 0], lines[v, 1])
         row = out[v, left:end]
         if ids is not None:
             marks = ids[v, left:end]
         for u in range(len(x_span)):
-            x = x_span[u]
-            a, b, d = d0 + x * r[0], d1 + x * r[1], d2 + x * r[2]
+            a, b, d = ray_of(pose, bent, v, left + u, start, x_span[u])
             enter = min(
                 i.enter_gain * a + i.enter_base,
                 min(j.enter_gain * b + j.enter_base, k.enter_gain * d + k.enter_base),
@@ -186,13 +186,14 @@ def draw_cylinder(
     number: int,
     lines: Lines,
     xs: Line,
+    bent: Bent | None,
     view: View,
     pose: Pose,
     half: Vec,
     rectangle: Rectangle,
 ) -> bool:
     """Draw a vertical cylinder with caps; return whether the camera is inside."""
-    c, r = pose.center, pose.along
+    c = pose.center
     k = _slab(c[2] - half[2], c[2] + half[2])
     # Side: (c.c - radius²) s² - 2 (d.c) s + d.d = 0, horizontal components only.
     cc = c[0] * c[0] + c[1] * c[1] - half[0] * half[0]
@@ -204,13 +205,12 @@ def draw_cylinder(
     top, bottom, left, end = rectangle
     x_span = xs[left:end]
     for v in range(top, bottom):
-        d0, d1, d2 = _line_start(pose, lines[v, 0], lines[v, 1])
+        start = _line_start(pose, lines[v, 0], lines[v, 1])
         row = out[v, left:end]
         if ids is not None:
             marks = ids[v, left:end]
         for u in range(len(x_span)):
-            x = x_span[u]
-            a, b, d = d0 + x * r[0], d1 + x * r[1], d2 + x * r[2]
+            a, b, d = ray_of(pose, bent, v, left + u, start, x_span[u])
             toward = a * c[0] + b * c[1]
             square = toward * toward - cc * (a * a + b * b)
             root = math.sqrt(max(square, 0.0))
@@ -233,13 +233,14 @@ def draw_sphere(
     number: int,
     lines: Lines,
     xs: Line,
+    bent: Bent | None,
     view: View,
     pose: Pose,
     radius: float,
     rectangle: Rectangle,
 ) -> bool:
     """Draw a sphere; return whether the camera is inside."""
-    c, r = pose.center, pose.along
+    c = pose.center
     cc = dot(c, c) - radius * radius
     if cc <= 0.0:
         return True
@@ -247,13 +248,12 @@ def draw_sphere(
     top, bottom, left, end = rectangle
     x_span = xs[left:end]
     for v in range(top, bottom):
-        d0, d1, d2 = _line_start(pose, lines[v, 0], lines[v, 1])
+        start = _line_start(pose, lines[v, 0], lines[v, 1])
         row = out[v, left:end]
         if ids is not None:
             marks = ids[v, left:end]
         for u in range(len(x_span)):
-            x = x_span[u]
-            a, b, d = d0 + x * r[0], d1 + x * r[1], d2 + x * r[2]
+            a, b, d = ray_of(pose, bent, v, left + u, start, x_span[u])
             toward = a * c[0] + b * c[1] + d * c[2]
             square = toward * toward - cc * (a * a + b * b + d * d)
             s = gain * (toward + math.sqrt(max(square, 0.0)))

@@ -51,6 +51,32 @@ class Pose(NamedTuple):
     center: Vec
 
 
+class Bent(NamedTuple):
+    """The unit rays of an image that is not affine along its lines: a fisheye's.
+
+    Shares of the axes of `Pose` in each ray; none at all in pixels that see nothing.
+    """
+
+    forward: NDArray[np.float64]  # (n, m)
+    across: NDArray[np.float64]  # (n, m)
+    along: NDArray[np.float64]  # (n, m)
+
+
+@kernel
+def ray_of(pose: Pose, bent: Bent | None, v: int, u: int, start: Vec, x: float) -> Vec:
+    """Return the ray of pixel u on line v, whose line starts so and whose place on it is x."""
+    r = pose.along
+    if bent is None:
+        return start[0] + x * r[0], start[1] + x * r[1], start[2] + x * r[2]
+    f, d = pose.forward, pose.across
+    i, j, k = bent.forward[v, u], bent.across[v, u], bent.along[v, u]
+    return (
+        i * f[0] + j * d[0] + k * r[0],
+        i * f[1] + j * d[1] + k * r[1],
+        i * f[2] + j * d[2] + k * r[2],
+    )
+
+
 @kernel
 def dot(a: Vec, b: Vec) -> float:
     """Return the scalar product."""
@@ -168,3 +194,50 @@ def cut(out: Image, view: View, span: Span, turns: int) -> Rectangle:
     around = turns * 2.0 * math.pi * view.focal
     first, last = _pixels(span[0] + around, span[1] + around, out.shape[0])
     return first, last, span[2], span[3]
+
+
+@kernel
+def fisheye_rectangle(out: Image, view: View, pose: Pose, half: Vec, sphere: bool) -> Rectangle:
+    """Return the pixels of a fisheye that can see a body; empty when none can.
+
+    They bound the part of a ring that the sphere around the body falls into: directions as far from
+    the optical axis, and in as many of the planes through it. Arguments as of `pinhole_rectangle`.
+    """
+    f, r, d, c = pose.forward, pose.along, pose.across, pose.center
+    z, x, y = dot(f, c), dot(r, c), dot(d, c)
+    aside, distance = math.hypot(x, y), math.sqrt(dot(c, c))
+    radius = half[0] if sphere else math.sqrt(dot(half, half))
+    if (distance - radius) * view.s_min > 1.0:
+        return 0, 0, 0, 0
+    if distance <= radius:
+        return 0, out.shape[0], 0, out.shape[1]
+    off, spread = math.atan2(aside, z), math.asin(radius / distance)
+    inner, outer = view.focal * (off - spread), view.focal * (off + spread)
+    left, right, top, bottom = -outer, outer, -outer, outer
+    if off > spread and off + spread < math.pi:
+        # Seen from the axis it covers so much to either side of its plane.
+        turn = math.asin(min(math.sin(spread) / math.sin(off), 1.0))
+        plane = math.atan2(y, x)
+        left, right = _reached(plane - turn, plane + turn, inner, outer)
+        quarter = 0.5 * math.pi
+        top, bottom = _reached(plane - turn - quarter, plane + turn - quarter, inner, outer)
+    u_centre, v_centre = view.pixel_centre, view.line_centre
+    u0, u1 = _pixels(u_centre + left, u_centre + right, out.shape[1])
+    v0, v1 = _pixels(v_centre + top, v_centre + bottom, out.shape[0])
+    return v0, v1, u0, u1
+
+
+@kernel
+def _reached(first: float, last: float, inner: float, outer: float) -> tuple[float, float]:
+    """Return how far part of a ring, between two angles, reaches along the axis of angle 0."""
+    turn = 2.0 * math.pi
+    high = max(math.cos(first), math.cos(last))
+    low = min(math.cos(first), math.cos(last))
+    if math.floor(last / turn) >= math.ceil(first / turn):
+        high = 1.0
+    if math.floor(last / turn - 0.5) >= math.ceil(first / turn - 0.5):
+        low = -1.0
+    return (
+        (outer if low < 0.0 else inner) * low,
+        (outer if high > 0.0 else inner) * high,
+    )

@@ -4,7 +4,8 @@ A pinhole's pixel has the ray d = forward + x right + y down with (x, y) = ((u -
 (v - cy) / focal), so the distance t along it is the depth along the optical axis (planar z-depth,
 RealSense Z16). A cylinder's has d = cos(a) forward + sin(a) right + y down with a = (u - cx) /
 focal, and t is the depth in the plane of forward and right. Either is affine along a line of the
-image, and these lines are what is drawn: the rows of a pinhole, the columns of a cylinder.
+image, and these lines are what is drawn: the rows of a pinhole, the columns of a cylinder. Each
+pixel of a fisheye has a ray of its own, a unit vector, and t is the range along it.
 Everything is done on inverse depth s = 1 / t. Of a plane it is n.d / n.(p - o): affine in the
 pixel, no division, finite for grazing rays. Of a sphere or cylinder it is a root of a quadratic.
 A convex body is hit where its last entry is no farther than its first exit. The image keeps the
@@ -42,11 +43,13 @@ from airl_mav.camera.primitives import (
 )
 from airl_mav.camera.projection import (
     MIN_DEPTH_M,
+    Bent,
     Image,
     Pose,
     View,
     cut,
     cylinder_span,
+    fisheye_rectangle,
     pinhole_rectangle,
 )
 from airl_mav.core.kernels import kernel
@@ -61,6 +64,7 @@ def _draw_obstacle(
     number: int,
     lines: Lines,
     xs: Line,
+    bent: Bent | None,
     view: View,
     world: Pose,
     shape: int,
@@ -81,7 +85,9 @@ def _draw_obstacle(
     turns = 0
     span = (0.0, 0.0, 0, 0)
     rectangle = (0, 0, 0, 0)
-    if view.cylindrical:
+    if bent is not None:
+        rectangle = fisheye_rectangle(out, view, pose, half, sphere)
+    elif view.cylindrical:
         # What is behind the camera may be at both ends of the image.
         turns = 1
         span = cylinder_span(out, view, pose, half, sphere)
@@ -97,11 +103,11 @@ def _draw_obstacle(
             continue
         inside: bool
         if shape == BOX:
-            inside = draw_box(out, ids, number, lines, xs, view, pose, half, rectangle)
+            inside = draw_box(out, ids, number, lines, xs, bent, view, pose, half, rectangle)
         elif shape == CYLINDER:
-            inside = draw_cylinder(out, ids, number, lines, xs, view, pose, half, rectangle)
+            inside = draw_cylinder(out, ids, number, lines, xs, bent, view, pose, half, rectangle)
         else:
-            inside = draw_sphere(out, ids, number, lines, xs, view, pose, half[0], rectangle)
+            inside = draw_sphere(out, ids, number, lines, xs, bent, view, pose, half[0], rectangle)
         if inside:
             return True
     return False
@@ -118,6 +124,16 @@ def invert(out: Image) -> None:
             s = row[u]
             t = one / min(max(s, least), most)
             row[u] = t if s > zero else zero
+
+
+@kernel
+def blank(out: Image, bent: Bent) -> None:
+    """Write 0 where a fisheye's pixels see nothing at all."""
+    for v in range(out.shape[0]):
+        for u in range(out.shape[1]):
+            i, j, k = bent.forward[v, u], bent.across[v, u], bent.along[v, u]
+            if i == 0.0 and j == 0.0 and k == 0.0:
+                out[v, u] = 0.0
 
 
 @kernel
@@ -173,6 +189,7 @@ def draw_bodies(
     drawn_in: Rectangles | None,
     lines: Lines,
     xs: Line,
+    bent: Bent | None,
     view: View,
     axes: Pose,
     camera: Vec,
@@ -194,6 +211,7 @@ def draw_bodies(
             nobody asks.
         lines: Of `aim`, with the next three.
         xs: Rays of a line.
+        bent: A fisheye's rays, in place of both; None: it is another image.
         view: How the image sees.
         axes: The camera's axes.
         camera: (3,) NED [m], above the floor.
@@ -216,7 +234,8 @@ def draw_bodies(
     half_room = (0.5 * (bounds[1] - bounds[0]), 0.5 * (bounds[3] - bounds[2]), 0.5 * bounds[4])
     forward, across, along = axes.forward, axes.across, axes.along
     closed = bounds[5] > 0.0
-    draw_room(out, ids, lines, xs, view, Pose(forward, across, along, room), half_room, closed)
+    pose = Pose(forward, across, along, room)
+    draw_room(out, ids, lines, xs, bent, view, pose, half_room, closed)
     for i in range(len(shape)):
         if is_owned(meshes, i):
             continue
@@ -225,7 +244,9 @@ def draw_bodies(
         pose = Pose(forward, across, along, offset)
         kept = None if drawn_in is None else drawn_in[i]
         number = OBSTACLE + i
-        if _draw_obstacle(out, ids, kept, number, lines, xs, view, pose, shape[i], half, yaw[i]):
+        if _draw_obstacle(
+            out, ids, kept, number, lines, xs, bent, view, pose, shape[i], half, yaw[i]
+        ):
             return i
     if meshes is not None:
         draw_meshes(out, ids, faces, drawn_in, lines, xs, view, axes, camera, meshes)
@@ -248,6 +269,7 @@ def render_depth(
     half_size: NDArray[np.float64],
     yaw: NDArray[np.float64],
     meshes: Meshes | None,
+    bent: Bent | None,
 ) -> None:
     """Render the depth image of an arena.
 
@@ -260,7 +282,7 @@ def render_depth(
 
     Args:
         out: (height, width) depth [m], written; 0 = no return. Along the optical axis of a pinhole,
-            in the camera's horizontal plane of a cylinder.
+            in the camera's horizontal plane of a cylinder, along the ray of a fisheye.
         position: (3,) camera NED [m].
         quaternion: (4,) unit [w, x, y, z] camera -> NED: its x axis is the optical axis, y points
             to the right of the image, z to its bottom.
@@ -275,6 +297,8 @@ def render_depth(
         half_size: (n, 3) as in `Obstacles` [m].
         yaw: (n,) heading of a box's first axis [rad].
         meshes: Those that are seen; None: there are none, and nothing is spent on them.
+        bent: The rays of a fisheye (`fisheye.bent_of`), which sees no meshes; None: it is a pinhole
+            or a cylinder.
     """
     camera = (position[0], position[1], min(position[2], -MIN_DEPTH_M))
     height, width = out.shape
@@ -284,11 +308,13 @@ def render_depth(
     # A cylinder's is drawn column by column, each in one piece; `out` gets them at the end.
     drawn = np.empty((width, height), np.float32) if cylindrical else out
     inside = draw_bodies(
-        drawn, None, None, lines, xs, view, axes, camera, bounds, shape, center, half_size, yaw,
-        meshes, None,
+        drawn, None, None, lines, xs, bent, view, axes, camera, bounds, shape, center, half_size,
+        yaw, meshes, None,
     )  # fmt: skip
     if inside >= 0:
         out[:, :] = MIN_DEPTH_M
+        if bent is not None:
+            blank(out, bent)
         return
     invert(drawn)
     if cylindrical:

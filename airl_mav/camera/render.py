@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.bvh import meshes_of
+from airl_mav.camera.fisheye import bent_of, check_meshes
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.raycast import render_depth
 from airl_mav.core.kernels import kernel
-from airl_mav.vehicle.rotation import Quat, Vec, multiply, rotate
+from airl_mav.vehicle.rotation import Quat, Vec, exponential, multiply, rotate
 
 
 class Mount(NamedTuple):
@@ -23,6 +24,33 @@ class Mount(NamedTuple):
     """Position of the camera in the body frame FRD [m]."""
     pitch_up: float
     """Angle of the optical axis above the body's forward axis [rad]."""
+
+
+class Motion(NamedTuple):
+    """How a vehicle moves at a moment."""
+
+    position: NDArray[np.float64]
+    """(3,) NED [m]."""
+    quaternion: NDArray[np.float64]
+    """(4,) unit [w, x, y, z] body -> NED."""
+    velocity: NDArray[np.float64]
+    """(3,) NED [m/s]."""
+    rates: NDArray[np.float64]
+    """(3,) angular velocity FRD [rad/s]."""
+
+    @classmethod
+    def at_rest(cls, position: NDArray[np.float64], quaternion: NDArray[np.float64]) -> Motion:
+        """Return that of a vehicle that stands still."""
+        return cls(position, quaternion, np.zeros(3), np.zeros(3))
+
+
+@kernel
+def carried_on(motion: Motion, seconds: float) -> tuple[Vec, Quat]:
+    """Return position and attitude after a time [s], of unchanged velocity and angular rates."""
+    p, v, q, w = motion.position, motion.velocity, motion.quaternion, motion.rates
+    turned = exponential((seconds * w[0], seconds * w[1], seconds * w[2]))
+    at = (p[0] + seconds * v[0], p[1] + seconds * v[1], p[2] + seconds * v[2])
+    return at, multiply((q[0], q[1], q[2], q[3]), turned)
 
 
 @kernel
@@ -66,8 +94,9 @@ def render(
         quaternion: (4,) unit [w, x, y, z] camera -> NED; its x axis is the optical axis.
 
     Raises:
-        UsageError: The file of a mesh cannot be read, or is another one.
+        UsageError: The file of a mesh cannot be read, or is another one; a fisheye looks at one.
     """
+    check_meshes(intrinsics, arena)
     k, obstacles = intrinsics, arena.obstacles
     image = np.empty((k.height, k.width), np.float32)
     render_depth(
@@ -85,5 +114,6 @@ def render(
         obstacles.half_size,
         obstacles.yaw,
         meshes_of(arena.meshes, len(obstacles)),
+        bent_of(k),
     )
     return image

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.camera.primitives import BOX, CYLINDER, OBSTACLE, Ids, Line, Lines, turned
-from airl_mav.camera.projection import Pose, Rectangle, View, dot
+from airl_mav.camera.projection import Bent, Pose, Rectangle, View, dot, ray_of
 from airl_mav.camera.shading import F32, ONE, ZERO, Plane, Rays, Vec32
 from airl_mav.core.kernels import kernel
 from airl_mav.vehicle.rotation import Vec
@@ -104,6 +104,24 @@ def start32(axes: Pose, ahead: float, y: float) -> Vec32:
 
 
 @kernel
+def along32(pose: Pose) -> Vec32:
+    """Return the axis along a line."""
+    r = pose.along
+    return F32(r[0]), F32(r[1]), F32(r[2])
+
+
+@kernel
+def ray32(
+    pose: Pose, along: Vec32, bent: Bent | None, v: int, u: int, start: Vec32, x: np.float32
+) -> Vec32:
+    """Return the ray of pixel u on line v as `projection.ray_of` does."""
+    if bent is None:
+        return start[0] + x * along[0], start[1] + x * along[1], start[2] + x * along[2]
+    n, e, d = ray_of(pose, bent, v, u, (0.0, 0.0, 0.0), 0.0)
+    return F32(n), F32(e), F32(d)
+
+
+@kernel
 def shade_by_obstacle(
     lit: Plane,
     far: Plane,
@@ -112,6 +130,7 @@ def shade_by_obstacle(
     number: int,
     lines: Lines,
     xs: Line,
+    bent: Bent | None,
     view: View,
     world: Pose,
     camera: Vec,
@@ -130,6 +149,7 @@ def shade_by_obstacle(
         number: Of the obstacle.
         lines: Of the image.
         xs: Rays of a line.
+        bent: A fisheye's rays, in place of both; None: it is another image.
         view: How the image sees.
         world: The camera's axes, and the obstacle's centre from the camera.
         camera: (3,) NED [m].
@@ -147,7 +167,7 @@ def shade_by_obstacle(
     pose = turned(world, cos, sin)
     sun = (cos * to_sun[0] + sin * to_sun[1], cos * to_sun[1] - sin * to_sun[0], to_sun[2])
     top, bottom, left, end = 0, len(lines), 0, len(xs)
-    if not view.cylindrical:
+    if bent is None and not view.cylindrical:
         floor = -(world.center[2] + camera[2])
         top, bottom, left, end = shadow_rectangle(
             corners, len(lines), len(xs), view, pose, half, sun, floor
@@ -155,35 +175,36 @@ def shade_by_obstacle(
     if top >= bottom or left >= end:
         return
     left, end = widened(left, end, 0, len(xs))
-    f, c, r = pose, pose.center, pose.along
+    f, c, along = pose, pose.center, along32(pose)
     c0, c1, c2 = F32(c[0]), F32(c[1]), F32(c[2])
-    r0, r1, r2 = F32(r[0]), F32(r[1]), F32(r[2])
     s0, s1, s2 = F32(sun[0]), F32(sun[1]), F32(sun[2])
     i0, i1, i2 = F32(1.0 / sized(sun[0])), F32(1.0 / sized(sun[1])), F32(1.0 / sized(sun[2]))
     w0, w1, w2 = F32(half[0]) * abs(i0), F32(half[1]) * abs(i1), F32(half[2]) * abs(i2)
     square, per_level = F32(half[0] * half[0]), F32(1.0 / max(level, 1e-6))
     own = np.int32(OBSTACLE + number)
     for v in range(top, bottom):
-        d0, d1, d2 = start32(f, lines[v, 0], lines[v, 1])
+        start = start32(f, lines[v, 0], lines[v, 1])
         far_row, ids_row, lit_row = far[v, left:end], ids[v, left:end], lit[v, left:end]
         x_row = xs[left:end]
         if shape == BOX:
             for u in range(end - left):
-                x, t = F32(x_row[u]), far_row[u]
-                a = (c0 - t * (d0 + x * r0)) * i0
-                b = (c1 - t * (d1 + x * r1)) * i1
-                d = (c2 - t * (d2 + x * r2)) * i2
+                t = far_row[u]
+                n, e, s = ray32(f, along, bent, v, left + u, start, F32(x_row[u]))
+                a = (c0 - t * n) * i0
+                b = (c1 - t * e) * i1
+                d = (c2 - t * s) * i2
                 enter = max(max(a - w0, b - w1), d - w2)
                 leave = min(min(a + w0, b + w1), d + w2)
                 hidden = (leave >= max(enter, ZERO)) & (ids_row[u] != own)
                 lit_row[u] = ZERO if hidden else lit_row[u]
         elif shape == CYLINDER:
             for u in range(end - left):
-                x, t = F32(x_row[u]), far_row[u]
+                t = far_row[u]
+                n, e, s = ray32(f, along, bent, v, left + u, start, F32(x_row[u]))
                 # Its first axis lies under the sun: the light's way is along it, seen from above.
-                a = c0 - t * (d0 + x * r0)
-                b = c1 - t * (d1 + x * r1)
-                d = (c2 - t * (d2 + x * r2)) * i2
+                a = c0 - t * n
+                b = c1 - t * e
+                d = (c2 - t * s) * i2
                 rest = square - b * b
                 chord = np.sqrt(max(rest, ZERO))
                 enter = max((a - chord) * per_level, d - w2)
@@ -193,10 +214,11 @@ def shade_by_obstacle(
                 lit_row[u] = ZERO if hidden else lit_row[u]
         else:
             for u in range(end - left):
-                x, t = F32(x_row[u]), far_row[u]
-                a = c0 - t * (d0 + x * r0)
-                b = c1 - t * (d1 + x * r1)
-                d = c2 - t * (d2 + x * r2)
+                t = far_row[u]
+                n, e, s = ray32(f, along, bent, v, left + u, start, F32(x_row[u]))
+                a = c0 - t * n
+                b = c1 - t * e
+                d = c2 - t * s
                 toward = a * s0 + b * s1 + d * s2
                 apart = a * a + b * b + d * d - toward * toward
                 hidden = (apart < square) & (toward > ZERO) & (ids_row[u] != own)

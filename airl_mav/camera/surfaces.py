@@ -26,7 +26,7 @@ from airl_mav.camera.primitives import (
     Lines,
     turned,
 )
-from airl_mav.camera.projection import MIN_DEPTH_M, Pose
+from airl_mav.camera.projection import MIN_DEPTH_M, Bent, Pose
 from airl_mav.camera.shading import (
     F32,
     I32,
@@ -44,7 +44,7 @@ from airl_mav.camera.shading import (
     texel_at,
     turn_of,
 )
-from airl_mav.camera.shadows import start32, widened
+from airl_mav.camera.shadows import along32, ray32, start32, widened
 from airl_mav.camera.textures import SIDE
 from airl_mav.core.kernels import kernel
 from airl_mav.vehicle.rotation import Vec
@@ -82,20 +82,19 @@ def span_of(
 
 
 @kernel
-def write_rays(rays: Rays, lines: Lines, xs: Line, axes: Pose) -> None:
+def write_rays(rays: Rays, lines: Lines, xs: Line, bent: Bent | None, axes: Pose) -> None:
     """Write the ray of every pixel of an image's lines."""
-    r0, r1, r2 = F32(axes.along[0]), F32(axes.along[1]), F32(axes.along[2])
+    r = along32(axes)
     n = len(xs)
     for v in range(len(lines)):
-        d0, d1, d2 = start32(axes, lines[v, 0], lines[v, 1])
+        start = start32(axes, lines[v, 0], lines[v, 1])
         north, east, down = (
             rays.north[v * n : v * n + n],
             rays.east[v * n : v * n + n],
             rays.down[v * n : v * n + n],
         )
         for u in range(n):
-            x = F32(xs[u])
-            north[u], east[u], down[u] = d0 + x * r0, d1 + x * r1, d2 + x * r2
+            north[u], east[u], down[u] = ray32(axes, r, bent, v, u, start, F32(xs[u]))
 
 
 @kernel
@@ -230,6 +229,7 @@ def shade_obstacle(
     number: int,
     lines: Lines,
     xs: Line,
+    bent: Bent | None,
     world: Pose,
     shape: int,
     half: Vec,
@@ -247,7 +247,7 @@ def shade_obstacle(
     cos, sin = (math.cos(yaw), math.sin(yaw)) if shape == BOX else (1.0, 0.0)
     pose = turned(world, cos, sin)
     c0, c1, c2 = F32(pose.center[0]), F32(pose.center[1]), F32(pose.center[2])
-    r0, r1, r2 = F32(pose.along[0]), F32(pose.along[1]), F32(pose.along[2])
+    r = along32(pose)
     s0 = F32(cos * light.to_sun[0] + sin * light.to_sun[1])
     s1 = F32(cos * light.to_sun[1] - sin * light.to_sun[0])
     s2 = light.to_sun[2]
@@ -264,11 +264,11 @@ def shade_obstacle(
         if end == 0:
             continue
         x_row, far_row = xs[left - line : end - line], far[left:end]
-        d0, d1, d2 = start32(pose, lines[v, 0], lines[v, 1])
+        start, first = start32(pose, lines[v, 0], lines[v, 1]), left - line
         if shape == BOX:
             for u in range(end - left):
-                x, t = F32(x_row[u]), far_row[u]
-                n, e, d = d0 + x * r0, d1 + x * r1, d2 + x * r2
+                t = far_row[u]
+                n, e, d = ray32(pose, r, bent, v, first + u, start, F32(x_row[u]))
                 a, b, c = t * n - c0, t * e - c1, t * d - c2
                 qa, qb, qc = abs(a) * per0, abs(b) * per1, abs(c) * per2
                 on_c = qc >= max(qa, qb)
@@ -286,8 +286,8 @@ def shade_obstacle(
                 ups[u] = up if on_c else ZERO
         elif shape == CYLINDER:
             for u in range(end - left):
-                x, t = F32(x_row[u]), far_row[u]
-                n, e, d = d0 + x * r0, d1 + x * r1, d2 + x * r2
+                t = far_row[u]
+                n, e, d = ray32(pose, r, bent, v, first + u, start, F32(x_row[u]))
                 a, b, c = t * n - c0, t * e - c1, t * d - c2
                 cap = abs(c) * per2 * radius >= np.sqrt(a * a + b * b)
                 normal = d if cap else (a * n + b * e) * per0
@@ -302,8 +302,8 @@ def shade_obstacle(
                 ups[u] = up if cap else ZERO
         else:
             for u in range(end - left):
-                x, t = F32(x_row[u]), far_row[u]
-                n, e, d = d0 + x * r0, d1 + x * r1, d2 + x * r2
+                t = far_row[u]
+                n, e, d = ray32(pose, r, bent, v, first + u, start, F32(x_row[u]))
                 a, b, c = t * n - c0, t * e - c1, t * d - c2
                 normal = (a * n + b * e + c * d) * per0
                 to_sun = (a * s0 + b * s1 + c * s2) * per0

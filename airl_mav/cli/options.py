@@ -352,6 +352,7 @@ EXTRAS = {
     "black-box": ("mcap",),
     "export": ("foxglove", "mcap"),
     "film": ("av",),
+    "jpeg": ("PIL",),
     "mesh": ("trimesh",),
     "profile": ("onnx",),
     "refit": ("mcap", "pyulog"),

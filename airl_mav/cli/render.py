@@ -15,6 +15,7 @@ from rich.console import Console
 from airl_mav.arena.generate import generate
 from airl_mav.black_box.messages import SUFFIX
 from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.render import Motion
 from airl_mav.cli.options import POSITIONAL, check_installed
 from airl_mav.cli.recordings import folder_of
 from airl_mav.core.console import new_console
@@ -27,6 +28,7 @@ from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.camera_kind import Renderer
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.projection import Projection, check_fov
+from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.run_folder import load
 from airl_mav.report.arenas import trust_arenas
 from airl_mav.report.camera_pictures import (
@@ -40,6 +42,7 @@ from airl_mav.report.camera_pictures import (
     write_film,
     write_png,
 )
+from airl_mav.report.camera_taken import TakingCamera, taken_film
 from airl_mav.report.replay.runs import ReplayedRun
 from airl_mav.scenario.model import DEFAULT_ARENA, GREATEST_SEED
 
@@ -51,11 +54,19 @@ STILL_PX, FILM_PX = (960, 640), (384, 256)
 
 OF_AN_ARENA = (
     *("seed", "north_m", "east_m", "height_m", "yaw_deg", "pitch_up_deg"),
-    *("time_s", "vehicle_width_m"),
+    *("time_s", "vehicle_width_m", "speed_m_s", "yaw_rate_deg_s"),
 )
 """Options that a flight has no use for: it has its own."""
 
 OF_A_FLIGHT = ("flight", "rate_hz", "trust")
+
+OF_NO_VEHICLE = (
+    *("show", "renderer", "samples", "projection", "width_px", "height_px", "fov_deg", "range_m"),
+)
+"""Options that the camera of a vehicle profile has no use for: it has its own."""
+
+OF_A_VEHICLE = ("speed_m_s", "yaw_rate_deg_s")
+"""Options of what moves with its camera."""
 
 
 class RenderOptions(ProfileModel):
@@ -68,6 +79,7 @@ class RenderOptions(ProfileModel):
         airl render forest.toml --north-m 10 --height-m 3 --yaw-deg 30 --out forest.png
         airl render dense-obstacles --show segmentation --out seen.png
         airl render dense-obstacles --renderer mitsuba --samples 256
+        airl render varied-looks --camera my-quad.toml --speed-m-s 5 --yaw-rate-deg-s 60
         airl render runs/A 7 --out flight.gif
         airl render runs/A 7 --renderer mitsuba --out flight.mp4
     """
@@ -85,6 +97,18 @@ class RenderOptions(ProfileModel):
     )
     show: Shown = Field(
         default="rgb", description="colour, its luma, depth (near is bright), or what is seen"
+    )
+    camera: str | None = Field(
+        default=None,
+        description="vehicle profile, a shipped name or a path to a .toml, whose camera takes the"
+        " picture: its size, lens and sensor, one ray a pixel; where and how it looks is then where"
+        " and how the vehicle does",
+    )
+    speed_m_s: float = quantity(
+        "with --camera: how fast the vehicle flies ahead", "m/s", ge=-100, le=100, default=0.0
+    )
+    yaw_rate_deg_s: float = quantity(
+        "with --camera: how fast it turns, clockwise", "deg/s", ge=-1000, le=1000, default=0.0
     )
     renderer: Renderer = Field(
         default="raycast", description="what draws; mitsuba draws rgb alone, without fog"
@@ -181,6 +205,11 @@ def _check(options: RenderOptions, filmed: bool) -> None:
     if options.out is not None and options.out.suffix.lower() not in suffixes:
         names = " or ".join(", ".join(suffixes).rsplit(", ", 1))
         raise FieldError("out", f"{options.out}", f"a file name that ends in {names}")
+    for name in OF_A_VEHICLE if options.camera is None else OF_NO_VEHICLE:
+        value = getattr(options, name)
+        if value != RenderOptions.model_fields[name].default:
+            with_it = "without" if options.camera is None else "with"
+            raise FieldError(name, value, problem=f"{with_it} --camera")
     check_fov("fov_deg", options.projection, options.fov_deg)
     if options.out is not None and options.out.suffix.lower() == VIDEO:
         check_installed("film")
@@ -219,7 +248,15 @@ def _picture(options: RenderOptions, out: Path) -> str:
     height = spec.flight_altitude_m if options.height_m is None else options.height_m
     position = np.array([options.north_m, options.east_m, -height])
     pitch, yaw = math.radians(options.pitch_up_deg), math.radians(options.yaw_deg)
-    centers = arena.centers_at(round(options.time_s * US_PER_S))
+    elapsed_us = round(options.time_s * US_PER_S)
+    if options.camera is not None:
+        velocity = options.speed_m_s * np.array([math.cos(yaw), math.sin(yaw), 0.0])
+        rates = np.array([0.0, 0.0, math.radians(options.yaw_rate_deg_s)])
+        motion = Motion(position, quat_from_euler(0.0, pitch, yaw), velocity, rates)
+        camera_of = TakingCamera(load_vehicle(options.camera).camera)
+        write_png(out, camera_of(arena, elapsed_us, motion, arena.seed))
+        return "picture"
+    centers = arena.centers_at(elapsed_us)
     camera = _camera(options, STILL_PX)
     drawn = _drawn(options, options.samples or SAMPLES[options.renderer])
     write_png(out, drawn(arena, centers, camera, position, quat_from_euler(0.0, pitch, yaw)))
@@ -237,6 +274,7 @@ def _film(options: RenderOptions, path: Path, out: Path, console: Console) -> st
     camera = _camera(options, FILM_PX)
     flight = run.flight(record)
     times = moments(flight, options.rate_hz)
+    taking = None if options.camera is None else TakingCamera(load_vehicle(options.camera).camera)
     with RichProgress(console) as progress:
         bar = progress.bar("film", len(times), unit="pictures")
 
@@ -245,5 +283,9 @@ def _film(options: RenderOptions, path: Path, out: Path, console: Console) -> st
                 yield time_us
                 bar.advance()
 
-        count = write_film(out, film(flight, camera, drawn, told()), options.rate_hz)
+        if taking is None:
+            pictures = film(flight, camera, drawn, told())
+        else:
+            pictures = taken_film(flight, taking, told())
+        count = write_film(out, pictures, options.rate_hz)
     return f"film of flight {record.index}, {count} pictures"

@@ -23,6 +23,9 @@ class Stream(IntEnum):
     FAULTS = 17
     STEREO = 18
     APPEARANCE = 19
+    PHOTONS = 20
+    EXPOSURE = 21
+    RANGING = 22
 
 
 def stream(seed: int, name: Stream, *more: int) -> np.random.Generator:

@@ -11,9 +11,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.camera.fisheye import bent_of
 from airl_mav.camera.frame import MAX_MM, MM_PER_M
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.noise import DepthNoise, noise_of, noisy_frame
+from airl_mav.camera.projection import Bent
 from airl_mav.camera.raycast import render_depth
 from airl_mav.camera.render import Mount, camera_pose
 from airl_mav.core.constants import TICK_US, US_PER_S
@@ -23,6 +25,7 @@ from airl_mav.envs.arenas import ArenaBatch, move_obstacles
 from airl_mav.envs.colour_images import ColourImages, Looks
 from airl_mav.envs.faults import BEFORE_US, TwinFault, later_us, twin_faults
 from airl_mav.envs.fleet import Fleet
+from airl_mav.envs.formed_images import FormedImages
 from airl_mav.envs.meshes import MeshBatch, MeshesSeen, meshes_in
 from airl_mav.envs.saved_state import Stateful
 from airl_mav.faults.kinds import NOISE_SEED
@@ -47,12 +50,14 @@ class Lens(NamedTuple):
     """Greatest depth that gives a return [m]."""
     cylindrical: bool = False
     """The image is a cylinder's."""
+    bent: Bent | None = None
+    """The rays of a fisheye."""
 
 
 def lens_of(intrinsics: Intrinsics, range_m: float) -> Lens:
     """Return the lens of a camera that sees `range_m` [m] far."""
     k = intrinsics
-    return Lens(k.focal, k.cx, k.cy, range_m, k.cylindrical)
+    return Lens(k.focal, k.cx, k.cy, range_m, k.cylindrical, bent_of(k))
 
 
 class Cameras(Stateful):
@@ -95,6 +100,10 @@ class Cameras(Stateful):
         if self.intrinsics.kind != "depth":
             assert looks is not None  # noqa: S101 - whoever makes colour cameras has arenas for them
             self._colour = ColourImages(self.intrinsics, self._mount, looks, self._meshes)
+        self._formed: FormedImages | None = None
+        """None: the cameras have no table `imaging`."""
+        if camera.imaging is not None and looks is not None:
+            self._formed = FormedImages(camera, looks)
         self._first_us = np.zeros(n, np.int64)
         failing = twin_faults(faults, "camera")
         self._late = [each for each in failing if each.fault.kind == "delay"]
@@ -181,7 +190,7 @@ class Cameras(Stateful):
         for number, at_us in self._freeze_us.items():
             who = np.abs(fleet.time_us - at_us) <= TICK_US // 2
             if who.any():
-                self._render(fleet, arenas, who, self._frozen[number])
+                self._render(fleet, arenas, who, seeds, self._frozen[number])
                 self._make_noisy(self._frozen[number], self._noise, who, seeds, fleet.time_us)
 
     def next_decoded_us(self, time_us: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -201,7 +210,7 @@ class Cameras(Stateful):
 
         The noise is drawn from the episodes' `seeds` (n,).
         """
-        self._render(fleet, arenas, who, self.image)
+        self._render(fleet, arenas, who, seeds, self.image)
         self._make_noisy(self.image, self._noise, who, seeds, fleet.time_us)
         for each in self._changed:
             acts = who & each.at(fleet.time_us)
@@ -214,10 +223,17 @@ class Cameras(Stateful):
                 self._make_noisy(self.image, noise, acts, own, fleet.time_us)
 
     def _render(
-        self, fleet: Fleet, arenas: ArenaBatch, who: NDArray[np.bool_], out: NDArray[Any]
+        self,
+        fleet: Fleet,
+        arenas: ArenaBatch,
+        who: NDArray[np.bool_],
+        seeds: NDArray[np.int64],
+        out: NDArray[Any],
     ) -> None:
-        """Write the images of the vehicles in `who` (n,), without noise."""
-        if self._colour is None:
+        """Write the images of the vehicles in `who` (n,), without the noise of conditions."""
+        if self._formed is not None:
+            self._formed.render(fleet, who, seeds, self._frames(fleet.time_us), out)
+        elif self._colour is None:
             render_images(fleet, arenas, who, self._mount, self._lens, out, self._meshes.batch)
         else:
             self._colour.render(fleet, arenas, who, out)
@@ -233,10 +249,15 @@ class Cameras(Stateful):
         """Add noise to the images of `who` (n,), taken at these times (n,) [µs]."""
         if noise is None:
             return
-        # Frames are taken at whole ticks, up to half of one before their time.
-        frame = (time_us + TICK_US // 2 - self._first_us) // self.period_us
+        frame = self._frames(time_us)
         for i in np.flatnonzero(who).tolist():
             image[i] = noisy_frame(image[i], noise, int(seeds[i]), int(frame[i]))
+
+    def _frames(self, time_us: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the numbers (n,) of frames that are taken at these times (n,) [µs]."""
+        # They are taken at whole ticks, up to half of one before their time.
+        frames: NDArray[np.int64] = (time_us + TICK_US // 2 - self._first_us) // self.period_us
+        return frames
 
     def _held(self) -> Mapping[str, Any]:
         return {"image": self.image, "first_us": self._first_us}
@@ -286,6 +307,7 @@ def render_images(
             arenas.half_size[i, :count],
             arenas.yaw[i, :count],
             None if meshes is None else meshes_in(meshes, i, count),
+            lens.bent,
         )
         _to_z16(image, out[i])
 

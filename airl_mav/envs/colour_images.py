@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 from airl_mav.arena.appearance import OBSTACLE
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.colour import Work, render_colour
+from airl_mav.camera.fisheye import bent_of
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.picture import ColourArrays, write_grey
+from airl_mav.camera.projection import Bent
 from airl_mav.camera.render import Mount, camera_pose
 from airl_mav.camera.textures import atlas
 from airl_mav.core.errors import UsageError
@@ -48,6 +50,8 @@ class Looks:
 
     def __init__(self, n: int) -> None:
         """Know none yet."""
+        self.arenas: list[Arena | None] = [None] * n
+        """Those that it knows the looks of."""
         self.batch = _empty(n, OBSTACLE)
         """What the kernel looks at; replaced where an arena has more surfaces than all before."""
         self.images: tuple[ImageFile, ...] = ()
@@ -65,6 +69,7 @@ class Looks:
                     " same images in all arenas that are flown in side by side"
                 )
             self.images = images
+        self.arenas[i] = arena
         look = ColourArrays.of(arena.look)
         room, count = self.batch.texture.shape[1], len(look.texture)
         if count > room:
@@ -91,7 +96,7 @@ class ColourImages:
     ) -> None:
         """Take the camera, its place on the body, how the arenas look, and their meshes."""
         k = intrinsics
-        self._lens = (k.focal, k.cx, k.cy, k.cylindrical)
+        self._lens, self._bent = (k.focal, k.cx, k.cy, k.cylindrical), bent_of(k)
         self._mount, self._looks, self._meshes = mount, looks, meshes
         self._work = Work.of(k.width, k.height, k.cylindrical)
         shape = (k.height, k.width)
@@ -113,6 +118,7 @@ class ColourImages:
             *self._lens,
             *room,
             atlas(self._looks.images),
+            self._bent,
             out,
         )
 
@@ -134,6 +140,7 @@ def render_colour_images(
     depth: NDArray[np.float32],
     seen: NDArray[np.int32],
     patterns: NDArray[np.float32],
+    bent: Bent | None,
     out: NDArray[np.uint8],
 ) -> None:
     """Render the colour image of every vehicle in `who`, from where it is now.
@@ -154,6 +161,7 @@ def render_colour_images(
         depth: (h, w).
         seen: (h, w).
         patterns: `textures.atlas()`.
+        bent: `fisheye.bent_of` the camera.
         out: (n, h, w, channels) sRGB, or grey where there is one channel, written.
     """
     grey = out.shape[3] == 1
@@ -188,6 +196,7 @@ def render_colour_images(
             looks.albedo[i, :surfaces],
             looks.lights[i],
             patterns,
+            bent,
         )
         if grey:
             pixels = rgb.shape[0] * rgb.shape[1]

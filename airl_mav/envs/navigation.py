@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.camera.conditions import check_noise
+from airl_mav.camera.conditions import check_noise, check_twin_imaging
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.constants import TICK_US, US_PER_MS, US_PER_S
 from airl_mav.core.errors import FieldError, UsageError
@@ -208,6 +208,7 @@ class Navigation(Stateful):
         randomisation = spec.randomisation
         check_spread(self.vehicle, randomisation, "randomisation")
         check_noise(self.camera, randomisation, faults, "randomisation")
+        check_twin_imaging(self.camera)
         table = self.vehicle.estimation if randomisation.estimation else None
         self._telemetry = Telemetry(n, table, randomisation.navigation_noise)
         check_twin(faults, pipelined=spec.decisions == "pipelined")

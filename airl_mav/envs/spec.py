@@ -14,7 +14,7 @@ from airl_mav.flight.judge import GOAL_RADIUS_M, TIME_LIMIT_S, GoalRadius, TimeL
 from airl_mav.policy.action_sets import PAPER_SPEED_M_S, ActionSetName, ActionSpec
 from airl_mav.policy.actions import DecisionTiming
 from airl_mav.policy.observation_spec import STRIP_ROWS, Frames, GoalHeight, LayoutName, Told
-from airl_mav.profiles.camera import Camera, check_matched
+from airl_mav.profiles.camera import Camera, check_matched, check_rows
 from airl_mav.profiles.camera_kind import CameraKind
 from airl_mav.profiles.conditions import SensorNoise, Spread, WindSettings
 from airl_mav.profiles.projection import CYLINDER_MOST_DEG, Projection, check_fov
@@ -63,9 +63,11 @@ class CameraChange(ProfileModel):
     """Changes to the vehicle's camera; what is left out stays as it is."""
 
     width_px: int | None = quantity("image width", "px", ge=8, le=640, default=None)
-    height_px: int | None = quantity("image height", "px", ge=6, le=480, default=None)
+    height_px: int | None = quantity("image height", "px", ge=1, le=480, default=None)
     projection: Projection | None = Field(
-        default=None, description="pinhole, or cylindrical for a field of view of up to 360 deg"
+        default=None,
+        description="pinhole, cylindrical for a field of view of up to 360 deg, or fisheye of up to"
+        " 190 deg",
     )
     horizontal_fov_deg: float | None = quantity(
         "horizontal field of view, less than 170 with a pinhole",
@@ -84,6 +86,7 @@ class CameraChange(ProfileModel):
         made = camera.model_copy(update=self.model_dump(exclude_none=True))
         check_fov("camera.horizontal_fov_deg", made.projection, made.horizontal_fov_deg)
         check_matched("camera.kind", made)
+        check_rows("camera.height_px", made)
         return made
 
 
@@ -233,7 +236,13 @@ class EnvironmentSpec(ProfileModel):
         " FILE.py:NAME",
     )
     image_width_px: int = quantity("image that the network sees", "px", ge=4, le=640, default=32)
-    image_height_px: int = quantity("image that the network sees", "px", ge=4, le=480, default=24)
+    image_height_px: int = quantity(
+        "image that the network sees; less than 4 only with layout scan",
+        "px",
+        ge=1,
+        le=480,
+        default=24,
+    )
     frames: Frames = 1
     in_flight: tuple[Told, ...] = Field(
         default=(), description="what else the network is told: command, latency, age"

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.camera.equidistant import fisheye_rays
 from airl_mav.policy.actions import Action
 from airl_mav.policy.observation import Observation
 
@@ -109,6 +110,8 @@ def near_points(observation: Observation, band_m: float) -> NDArray[np.float64]:
     if k.cylindrical:
         angle = (u - k.cx) / k.focal
         ahead, right = np.cos(angle) * z, np.sin(angle) * z
+    elif k.projection == "fisheye":
+        ahead, right, down = fisheye_rays(k)[:, v, u] * z
     # Heading frame from body: R_y(pitch) R_x(roll).
     cr, sr = math.cos(observation.roll), math.sin(observation.roll)
     cp, sp = math.cos(observation.pitch), math.sin(observation.pitch)

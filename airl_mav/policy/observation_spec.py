@@ -33,6 +33,9 @@ SEAM_SHARE = 8
 """`scan`: so many-th of the bearings of a camera that sees all round are repeated at either end, so
 that a convolution sees what is behind the vehicle in one piece."""
 
+LEAST_ROWS = 4
+"""Of an image that goes into a network: all but a scan's, which is a row for each frame."""
+
 MOST_FRAMES = 8
 """Most images that a network sees at a time."""
 
@@ -59,12 +62,17 @@ class ObservationSpec(ProfileModel):
     """What a network takes, and the camera that can provide it."""
 
     layout: LayoutName = Field(default="body", description="which arrays it takes")
-    height_px: int = quantity("height of the image that the network sees", "px", ge=4, le=480)
+    height_px: int = quantity(
+        "height of the image that the network sees; less than 4 only with layout scan",
+        "px",
+        ge=1,
+        le=480,
+    )
     width_px: int = quantity("width of the image that the network sees", "px", ge=4, le=640)
     projection: Projection = Field(
         default="pinhole",
-        description="how directions fall on the image: pinhole, or cylindrical for a field of view"
-        " of up to 360 deg",
+        description="how directions fall on the image: pinhole, cylindrical for a field of view of"
+        " up to 360 deg, or fisheye (equidistant) of up to 190 deg",
     )
     horizontal_fov_deg: float = quantity(
         "horizontal field of view, less than 170 with a pinhole",
@@ -105,10 +113,19 @@ class ObservationSpec(ProfileModel):
                 f"height_px = {self.height_px}: accepted: more than {STRIP_ROWS}, the rows of "
                 "the strip of layout 'paper'"
             )
+        if self.height_px < LEAST_ROWS and self.layout in SHIPPED and self.layout != "scan":
+            raise ValueError(
+                f"height_px = {self.height_px}: accepted: {LEAST_ROWS} or more with layout"
+                f" {self.layout!r}"
+            )
         if self.frames > 1 and self.layout == "paper":
             raise ValueError(f"frames = {self.frames}: accepted: 1 with layout 'paper'")
         if self.kind != "depth" and self.layout in ("paper", "scan"):
             raise ValueError(f"kind = {self.kind!r}: accepted: 'depth' with layout {self.layout!r}")
+        if self.projection == "fisheye" and self.layout == "scan":
+            raise ValueError(
+                "projection = 'fisheye': accepted: pinhole or cylindrical with layout 'scan'"
+            )
         if self.goal_height and self.layout == "paper":
             raise ValueError("goal_height = true: accepted: false with layout 'paper'")
         check_fov("horizontal_fov_deg", self.projection, self.horizontal_fov_deg)

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.camera.equidistant import fisheye_places, fisheye_rays
 from airl_mav.camera.frame import MAX_MM, MM_PER_M
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.profiles.camera import Camera
@@ -56,13 +57,18 @@ class Reprojector:
         u = (np.arange(k.width, dtype=np.float32) - np.float32(k.cx)) / np.float32(k.focal)
         v = (np.arange(k.height, dtype=np.float32) - np.float32(k.cy)) / np.float32(k.focal)
         rays = np.ones((3, k.height, k.width), np.float32)
-        if k.cylindrical:
+        if k.projection == "fisheye":
+            rays[:] = fisheye_rays(k)
+        elif k.cylindrical:
             rays[0], rays[1] = np.cos(u)[None, :], np.sin(u)[None, :]
         else:
             rays[1] = u[None, :]
-        rays[2] = v[:, None]
+        if k.projection != "fisheye":
+            rays[2] = v[:, None]
         self._rays = rays.reshape(3, -1)
         """(3, h w) what each pixel looks along at a depth of 1: forward, right, down."""
+        self._sees = self._rays.any(axis=0)
+        """(h w) whether a pixel looks anywhere: not outside of a fisheye's circle."""
 
     def image(self, sights: Sequence[Sight], pose: CameraPose) -> Image:
         """Return the depth image (h, w) [mm] from a pose; 0 = no return.
@@ -96,6 +102,8 @@ class Reprojector:
         depth[empty] = self._range_m
         points = (turn @ self._rays) * depth
         forward, right = points[0] + shift[0], points[1] + shift[1]
+        if k.projection == "fisheye":
+            return self._on_fisheye(np.stack([forward, right, points[2] + shift[2]]), empty)
         there = np.hypot(forward, right) if k.cylindrical else forward
         kept = there > LEAST_DEPTH_M
         scale = np.float32(k.focal) / np.maximum(there, np.float32(LEAST_DEPTH_M))
@@ -104,6 +112,27 @@ class Reprojector:
         else:
             column = np.rint(right * scale + np.float32(k.cx))
         row = np.rint((points[2] + shift[2]) * scale + np.float32(k.cy))
+        return self._fallen(column, row, there, kept, empty)
+
+    def _on_fisheye(
+        self, points: Floats, empty: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.intp], NDArray[np.uint32]]:
+        """Return as `_carried` what falls on a fisheye of points (3, h w) from the camera."""
+        there = np.sqrt((points * points).sum(axis=0))
+        column, row = (np.rint(place) for place in fisheye_places(self._k, points))
+        kept = self._sees & (there > LEAST_DEPTH_M)
+        return self._fallen(column, row, there, kept, empty)
+
+    def _fallen(
+        self,
+        column: Floats,
+        row: Floats,
+        there: Floats,
+        kept: NDArray[np.bool_],
+        empty: NDArray[np.bool_],
+    ) -> tuple[NDArray[np.intp], NDArray[np.uint32]]:
+        """Return the pixels that points fall on, of those that are kept, and their depths [mm]."""
+        k = self._k
         kept &= (column >= 0) & (column < k.width) & (row >= 0) & (row < k.height)
         column, row, there, empty = column[kept], row[kept], there[kept], empty[kept]
         pixels = (row * np.float32(k.width) + column).astype(np.intp)

@@ -6,11 +6,15 @@ from typing import Any
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
-from airl_mav.core.constants import US_PER_S
+from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.profiles.camera_kind import CameraKind
+from airl_mav.profiles.imaging import Imaging
 from airl_mav.profiles.projection import CYLINDER_MOST_DEG, Projection, check_fov
+
+LEAST_ROWS = 6
+"""Of an image that is no cylinder's."""
 
 
 class Stereo(ProfileModel):
@@ -27,6 +31,23 @@ class Stereo(ProfileModel):
     )
 
 
+class Ranging(ProfileModel):
+    """How a lidar or another sensor of ranges measures them; see `camera.noise`."""
+
+    noise_m: float = quantity("noise of a range, sd", "m", ge=0, le=5, default=0.0)
+    noise_share: float = quantity(
+        "noise that grows with the range, sd as a share of it", "1", ge=0, le=0.5, default=0.0
+    )
+    lost_share: float = quantity(
+        "share of returns that are lost, drawn anew with every image",
+        "1",
+        ge=0,
+        le=0.9,
+        default=0.0,
+    )
+    least_m: float = quantity("least depth that gives a return", "m", ge=0, le=10, default=0.0)
+
+
 class Camera(ProfileModel):
     """The camera, which looks ahead or all round."""
 
@@ -37,10 +58,16 @@ class Camera(ProfileModel):
     )
     projection: Projection = Field(
         default="pinhole",
-        description="pinhole, or cylindrical for a field of view of up to 360 deg",
+        description="pinhole, cylindrical for a field of view of up to 360 deg, or fisheye"
+        " (equidistant) of up to 190 deg",
     )
     width_px: int = quantity("image width", "px", ge=8, le=640)
-    height_px: int = quantity("image height", "px", ge=6, le=480)
+    height_px: int = quantity(
+        "image height; less than 6, down to the one row of a planar lidar, only of a cylinder",
+        "px",
+        ge=1,
+        le=480,
+    )
     horizontal_fov_deg: float = quantity(
         "horizontal field of view, less than 170 with a pinhole",
         "deg",
@@ -59,15 +86,27 @@ class Camera(ProfileModel):
         description="how depth is matched, of a depth camera with a pinhole; left out: depth"
         " without error",
     )
+    ranging: Ranging | None = Field(
+        default=None,
+        description="how a lidar measures depth; left out: without error",
+    )
+    imaging: Imaging | None = Field(
+        default=None,
+        description="how the image of an rgb or grey camera is formed; left out: as the ray caster"
+        " draws it",
+    )
 
     @model_validator(mode="after")
     def _projects(self) -> Camera:
         check_fov("camera.horizontal_fov_deg", self.projection, self.horizontal_fov_deg)
+        check_rows("camera.height_px", self)
         if self.stereo is not None and self.projection != "pinhole":
             raise FieldError(
                 "camera.stereo", self.projection, "left out where the projection is not pinhole"
             )
         check_matched("camera.kind", self)
+        if self.imaging is not None:
+            _check_imaging(self.imaging, self)
         return self
 
     @model_serializer(mode="wrap")
@@ -80,6 +119,10 @@ class Camera(ProfileModel):
             data.pop("projection", None)
         if self.stereo is None:
             data.pop("stereo", None)
+        if self.ranging is None:
+            data.pop("ranging", None)
+        if self.imaging is None:
+            data.pop("imaging", None)
         return data
 
     @property
@@ -89,8 +132,37 @@ class Camera(ProfileModel):
 
 
 def check_matched(field: str, camera: Camera) -> None:
-    """Raise FieldError, naming the field, for stereo matching where no depth is measured."""
+    """Raise FieldError, naming the field, for stereo matching or imaging of another kind."""
+    if camera.imaging is not None and camera.kind == "depth":
+        raise FieldError(
+            field,
+            camera.kind,
+            problem="with a table camera.imaging; accepted: rgb or grey with one",
+        )
+    if camera.ranging is not None and (camera.kind != "depth" or camera.stereo is not None):
+        problem = (
+            "with a table camera.ranging; accepted: 'depth' with one, and without camera.stereo"
+        )
+        raise FieldError(field, camera.kind, problem=problem)
     if camera.stereo is not None and camera.kind != "depth":
         raise FieldError(
             field, camera.kind, problem="with a table camera.stereo; accepted: 'depth' with one"
         )
+
+
+def check_rows(field: str, camera: Camera) -> None:
+    """Raise FieldError, naming the field, for an image that is too low for its projection."""
+    if camera.height_px < LEAST_ROWS and camera.projection != "cylindrical":
+        accepted = f"value >= {LEAST_ROWS} px with projection {camera.projection!r}"
+        raise FieldError(field, camera.height_px, accepted)
+
+
+def _check_imaging(imaging: Imaging, camera: Camera) -> None:
+    """Raise FieldError for what a camera's kind or rate cannot have."""
+    if imaging.bayer and camera.kind != "rgb":
+        accepted = f"false with a camera of kind {camera.kind!r}"
+        raise FieldError("camera.imaging.bayer", True, accepted)
+    period_ms = camera.period_us / US_PER_MS
+    if imaging.exposure_ms > period_ms:
+        accepted = f"value <= {period_ms:.4g} ms, the time between two frames"
+        raise FieldError("camera.imaging.exposure_ms", imaging.exposure_ms, accepted)

@@ -108,7 +108,8 @@ class ExportRequest(BaseModel):
         " depth",
     )
     projection: Projection | None = Field(
-        default=None, description="the camera's: pinhole or cylindrical; by default pinhole"
+        default=None,
+        description="the camera's: pinhole, cylindrical or fisheye; by default pinhole",
     )
     horizontal_fov_deg: float | None = Field(
         default=None, description="horizontal field of view of the camera, deg; by default 90"

@@ -51,6 +51,9 @@ from airl_mav.view.shown import Shown
 FRUSTUM_M = 0.6
 """How far ahead the camera's image is drawn, or above where it sees all round [m]."""
 
+WIDEST_FRUSTUM_DEG = 120.0
+"""Horizontal field of view of the widest frustum that is drawn [deg]."""
+
 UNROLLED_M = 2.0
 """Width of the image of a camera that sees all round [m]."""
 
@@ -295,7 +298,8 @@ class FlightScene:
                 wxyz=FRD_FROM_OPTICAL,
             )
             return
-        across = math.tan(0.5 * math.radians(shape.camera_fov_deg))
+        # A fisheye's is drawn as wide as a frustum can be.
+        across = math.tan(0.5 * math.radians(min(shape.camera_fov_deg, WIDEST_FRUSTUM_DEG)))
         self._camera = self._add(
             "camera_frustum",
             "/vehicle/camera",

@@ -59,11 +59,12 @@ def open_named_camera(name: str, clock: Clock, wanted: Intrinsics, whose: str) -
     """
     if "://" in name:
         return open_camera(name, clock)
-    if wanted.cylindrical:
+    if wanted.projection != "pinhole":
         raise FieldError(
             "camera",
             name,
-            problem=f"drivers give images of a pinhole, the camera of {whose} is cylindrical;"
+            problem=f"drivers give images of a pinhole, the camera of {whose} is"
+            f" {'a fisheye' if wanted.projection == 'fisheye' else 'cylindrical'};"
             " accepted: tcp://HOST:PORT or ipc://PATH of a publisher of such images",
         )
     if wanted.kind != "depth":

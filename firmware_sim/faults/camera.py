@@ -5,14 +5,11 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
-
-from numpy.typing import NDArray
 
 from airl_mav.camera.frame import Frame
 from airl_mav.camera.noise import DepthNoise, noisy_frame
+from airl_mav.camera.render import Motion
 from airl_mav.core.constants import US_PER_S
-from airl_mav.core.frames import Vector
 from airl_mav.faults.kinds import NOISE_SEED
 from airl_mav.profiles.conditions import SensorNoise
 from firmware_sim.faults.timeline import Acting, FaultTimeline
@@ -28,7 +25,7 @@ class FailingCamera:
         self._timeline = timeline
         self._seed = seed
         self._acting: list[Acting] = []
-        self._frozen: NDArray[Any] | None = None
+        self._frozen: Frame | None = None
         self._late: deque[tuple[int, Frame]] = deque()
         timeline.on_change(self._rearrange)
 
@@ -43,18 +40,10 @@ class FailingCamera:
         self._late.clear()
         self._camera.restart(time_us)
 
-    def offer(
-        self,
-        time_us: int,
-        position: Vector,
-        quaternion: Vector,
-        publish: Callable[[Frame], None],
-    ) -> None:
+    def offer(self, time_us: int, motion: Motion, publish: Callable[[Frame], None]) -> None:
         """Hand the frames that are due to `publish`; see `SimulatedCamera.offer`."""
         if time_us >= self._camera.next_us:
-            self._camera.offer(
-                time_us, position, quaternion, lambda frame: self._take(frame, publish)
-            )
+            self._camera.offer(time_us, motion, lambda frame: self._take(frame, publish))
         while self._late and self._late[0][0] <= time_us:
             publish(self._late.popleft()[1])
 
@@ -73,8 +62,8 @@ class FailingCamera:
                 frame = replace(frame, image=depth)
             else:  # stuck
                 if self._frozen is None:
-                    self._frozen = frame.image
-                frame = replace(frame, image=self._frozen)
+                    self._frozen = frame
+                frame = replace(frame, image=self._frozen.image, jpeg=self._frozen.jpeg)
         if delay_us or self._late:
             # A frame that was taken later must not overtake: a camera's frames come in order.
             due_us = frame.capture_time_us + delay_us

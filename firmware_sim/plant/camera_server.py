@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.exposure import exposure_by
 from airl_mav.camera.frame import Frame
+from airl_mav.camera.imaging import ImageFormation
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.noise import noise_of, noisy_frame
-from airl_mav.camera.render import Mount, camera_pose
+from airl_mav.camera.render import Motion, Mount, camera_pose
 from airl_mav.core.constants import DEG
 from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import Vector
@@ -49,6 +50,7 @@ class SimulatedCamera:
         """
         self._expose = exposure_by(renderer)
         self._noise = noise_of(camera, noise or SensorNoise())
+        self._forming = ImageFormation(camera) if camera.imaging is not None else None
         self._seed = seed
         self._intrinsics = Intrinsics.of(camera)
         self._mount = Mount((camera.forward_m, 0.0, -camera.up_m), camera.pitch_up_deg * DEG)
@@ -56,7 +58,10 @@ class SimulatedCamera:
         self._arena = arena
         self._sequence = 0
         # The first picture loads or compiles the kernels: better here than in flight.
-        self._look(0, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
+        at_rest = Motion.at_rest(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
+        self._look(0, at_rest.position, at_rest.quaternion)
+        if self._forming is not None:
+            self._forming.take(arena, 0, at_rest, seed, 0)
         self.restart(start_us)
 
     def restart(self, time_us: int) -> None:
@@ -67,33 +72,40 @@ class SimulatedCamera:
         self._start_us = self.next_us = time_us
         """`next_us`: simulated time from which on the next frame is due [µs]."""
         self._rate = Rate(self._rate_hz)
+        if self._forming is not None:
+            self._forming.restart()
 
-    def offer(
-        self,
-        time_us: int,
-        position: Vector,
-        quaternion: Vector,
-        publish: Callable[[Frame], None],
-    ) -> None:
-        """Take a frame that is due and hand it to `publish`; see `capture`."""
-        publish(self.capture(time_us, position, quaternion))
+    def offer(self, time_us: int, motion: Motion, publish: Callable[[Frame], None]) -> None:
+        """Take a frame that is due and hand it to `publish`; see `take`."""
+        publish(self.take(time_us, motion))
 
     def capture(self, time_us: int, position: Vector, quaternion: Vector) -> Frame:
+        """Take a frame that is due of a vehicle at rest; see `take`."""
+        return self.take(time_us, Motion.at_rest(position, quaternion))
+
+    def take(self, time_us: int, motion: Motion) -> Frame:
         """Take a frame that is due; the next is due one period after the slot that this one fills.
 
         Slots lie at whole multiples of the period, so that a rate that the tick does not divide
         is kept on average. Slots that were missed are left out.
 
-        It is exposed at simulated `time_us` [µs], from the vehicle's `position` (3,) NED [m] and
-        `quaternion` (4,) body -> NED [w, x, y, z].
+        It is exposed at simulated `time_us` [µs], which is the middle of an exposure that takes
+        time, from where the vehicle is then.
         """
         elapsed_us = time_us - self._start_us
         self._rate.due(elapsed_us)
         self.next_us = self._start_us + math.ceil(self._rate.next_us)
-        image = self._look(elapsed_us, position, quaternion)
+        image: NDArray[Any]
+        jpeg = None
+        if self._forming is not None:
+            image, jpeg = self._forming.take(
+                self._arena, elapsed_us, motion, self._seed, self._rate.period
+            )
+        else:
+            image = self._look(elapsed_us, motion.position, motion.quaternion)
         if self._noise is not None:
             image = noisy_frame(image, self._noise, self._seed, self._rate.period)
-        frame = Frame(self._sequence, time_us, image, self._intrinsics)
+        frame = Frame(self._sequence, time_us, image, self._intrinsics, jpeg)
         self._sequence += 1
         return frame
 

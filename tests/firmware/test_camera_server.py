@@ -137,6 +137,22 @@ def connected(
     raise AssertionError("the subscriber never got a frame")
 
 
+def test_a_jpeg_arrives_as_the_image_that_it_decodes_to() -> None:
+    seen = {"kind": "rgb", "imaging": {"jpeg_quality": 50}}
+    sent = take(SimulatedCamera(quad(camera=seen).camera, room(12.0, pillar_at=6.0)))
+    assert sent.jpeg is not None
+    server = CameraServer(LOOPBACK)
+    source = ZmqFrameSource(server.endpoint, SimClock(5))
+    try:
+        received = connected(server, source, sent).frame
+    finally:
+        source.close()
+        server.close()
+    assert received.jpeg == sent.jpeg
+    assert received.intrinsics == sent.intrinsics
+    np.testing.assert_array_equal(received.image, sent.image)
+
+
 @pytest.mark.parametrize("transport", ["tcp", "ipc"])
 def test_frame_arrives_whole(transport: str, tmp_path: Path) -> None:
     endpoint = LOOPBACK if transport == "tcp" else f"ipc://{tmp_path}/camera"

@@ -10,6 +10,7 @@ import pytest
 
 from airl_mav.camera.frame import Frame
 from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.render import Motion
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.envs.arenas import batch_of
 from airl_mav.envs.colour_images import ColourImages, Looks
@@ -104,16 +105,14 @@ def test_the_companion_gets_the_images_that_the_twin_renders(
 ) -> None:
     """To the bit, on the wire and as the network sees them."""
     taken: dict[int, tuple[np.ndarray, np.ndarray, Frame]] = {}
-    real = SimulatedCamera.capture
+    real = SimulatedCamera.take
 
-    def capture(
-        self: SimulatedCamera, time_us: int, position: np.ndarray, quaternion: np.ndarray
-    ) -> Frame:
-        frame = real(self, time_us, position, quaternion)
-        taken[time_us] = np.array(position), np.array(quaternion), frame
+    def take(self: SimulatedCamera, time_us: int, motion: Motion) -> Frame:
+        frame = real(self, time_us, motion)
+        taken[time_us] = np.array(motion.position), np.array(motion.quaternion), frame
         return frame
 
-    monkeypatch.setattr(SimulatedCamera, "capture", capture)
+    monkeypatch.setattr(SimulatedCamera, "take", take)
     asked, seen = scenario(policy, arena="dynamic-obstacles"), list[Observation]()
     learned = asked.fresh_policy(SEED)
     assert isinstance(learned, LearnedPolicy)
@@ -204,3 +203,50 @@ def test_what_does_not_see_alike_is_refused_in_one_line(policy: Path) -> None:
         scenario(policy, sensors={"depth_noise": 0.1})
     with pytest.raises(FieldError, match=r"faults.*a depth camera; the vehicle's is of kind 'rgb'"):
         scenario(policy, faults=("camera noise 0.1 at offboard",))
+
+
+FORMED = """
+base = "quad-rgb"
+description = "formed"
+[camera.imaging]
+exposure_ms = 15.0
+samples = 2
+vignetting = 0.3
+full_well_e = 4000.0
+bayer = true
+jpeg_quality = 75
+[camera.imaging.auto_exposure]
+"""
+
+
+def test_a_flight_sees_formed_images_as_jpeg_leaves_them(
+    policy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those that the wire would carry; the same flight again sees the same again."""
+    vehicle = tmp_path / "formed.toml"
+    vehicle.write_text(FORMED, encoding="utf-8")
+    taken: dict[int, tuple[Motion, Frame]] = {}
+    real = SimulatedCamera.take
+
+    def take(self: SimulatedCamera, time_us: int, motion: Motion) -> Frame:
+        frame = real(self, time_us, motion)
+        taken[time_us] = motion, frame
+        return frame
+
+    monkeypatch.setattr(SimulatedCamera, "take", take)
+    flights = []
+    for _ in range(2):
+        asked, seen = scenario(policy, vehicle=str(vehicle), time_limit_s=3.0), list[Observation]()
+        learned = asked.fresh_policy(SEED)
+        assert isinstance(learned, LearnedPolicy)
+        flown = fly(asked, Watching(learned, seen), 0, SEED)
+        for each, capture_us in zip(seen, flown.latency["capture_us"].tolist(), strict=True):
+            wired = Frame.from_bytes(taken[capture_us][1].to_bytes())
+            assert wired.jpeg is not None
+            assert wired.image.tobytes() == each.image.tobytes()
+        flights.append([each.image.tobytes() for each in seen])
+    assert len(set(flights[0])) == len(flights[0]) > 3
+    assert flights[0] == flights[1]
+    # It does move: what is exposed for a while is exposed in motion.
+    assert max(np.abs(motion.velocity).max() for motion, _ in taken.values()) > 0.5
+    assert max(np.abs(motion.rates).max() for motion, _ in taken.values()) > 0.1

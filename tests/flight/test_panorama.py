@@ -9,7 +9,7 @@ import pytest
 
 from airl_mav.camera.frame import Frame
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.render import Mount
+from airl_mav.camera.render import Motion, Mount
 from airl_mav.envs.arenas import batch_of
 from airl_mav.envs.cameras import lens_of, render_images
 from airl_mav.envs.encoding import COMPILED
@@ -45,15 +45,13 @@ def test_the_companion_gets_the_images_that_the_twin_renders(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     poses: dict[int, tuple[np.ndarray, np.ndarray]] = {}
-    real = SimulatedCamera.capture
+    real = SimulatedCamera.take
 
-    def capture(
-        self: SimulatedCamera, time_us: int, position: np.ndarray, quaternion: np.ndarray
-    ) -> Frame:
-        poses[time_us] = np.array(position), np.array(quaternion)
-        return real(self, time_us, position, quaternion)
+    def take(self: SimulatedCamera, time_us: int, motion: Motion) -> Frame:
+        poses[time_us] = np.array(motion.position), np.array(motion.quaternion)
+        return real(self, time_us, motion)
 
-    monkeypatch.setattr(SimulatedCamera, "capture", capture)
+    monkeypatch.setattr(SimulatedCamera, "take", take)
     scenario = demo_scenario(
         vehicle="quad-panorama", arena="dynamic-obstacles", policy="greedy", time_limit_s=20.0
     )

@@ -24,6 +24,7 @@ from airl_mav.policy.layouts import boxes
 from airl_mav.policy.learned import load_learned
 from airl_mav.policy.observation_spec import ObservationSpec, Told
 from airl_mav.profiles.camera_kind import CHANNELS, CameraKind
+from airl_mav.profiles.projection import Projection
 from airl_mav.scenario.model import Scenario
 from tests.support.policy_kit import export_tiny
 
@@ -84,9 +85,10 @@ def test_a_checkpoint_goes_on_in_the_same_colours() -> None:
         np.testing.assert_array_equal(ours["grey"], theirs["grey"])
 
 
+@pytest.mark.parametrize("projection", ["pinhole", "fisheye"])
 @pytest.mark.parametrize("kind", ["rgb", "grey"])
-def test_the_image_is_that_of_the_one_caster(kind: CameraKind) -> None:
-    env = Navigation(spec_of(None, knobs(kind)), 2)
+def test_the_image_is_that_of_the_one_caster(kind: CameraKind, projection: Projection) -> None:
+    env = Navigation(spec_of(None, knobs(camera={"kind": kind, "projection": projection})), 2)
     env.begin([0, 1], [5, 8])
     for i, arena in enumerate(env.arenas):
         assert arena is not None

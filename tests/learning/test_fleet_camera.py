@@ -23,6 +23,7 @@ from airl_mav.profiles.vehicle import load_vehicle
 N = 12
 CAMERA = Intrinsics.from_fov(64, 48, math.radians(87.0))
 PANORAMA = Intrinsics.of(load_vehicle("quad-panorama").camera)
+FISHEYE = Intrinsics.from_fov(64, 48, math.radians(170.0), "fisheye")
 MOUNT = Mount((0.12, 0.03, -0.02), math.radians(8.0))
 
 
@@ -51,7 +52,9 @@ def expected(
     return depth_to_z16(render(world, centers, camera, range_m, *pose))
 
 
-@pytest.mark.parametrize("camera", [CAMERA, PANORAMA], ids=["pinhole", "cylindrical"])
+@pytest.mark.parametrize(
+    "camera", [CAMERA, PANORAMA, FISHEYE], ids=["pinhole", "cylindrical", "fisheye"]
+)
 @pytest.mark.parametrize("range_m", [6.0, 20.0, 100.0])
 def test_sees_what_the_rehearsal_s_camera_sees(
     worlds: list[Arena], range_m: float, camera: Intrinsics

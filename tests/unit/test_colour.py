@@ -197,7 +197,8 @@ def poses(seed: int, n: int) -> list[tuple[tuple[float, float, float], NDArray[n
 
 
 def camera_of(projection: Projection) -> Intrinsics:
-    return Intrinsics.from_fov(64, 48, 1.6 if projection == "pinhole" else 2 * np.pi, projection)
+    fov = {"pinhole": 1.6, "cylindrical": 2 * np.pi, "fisheye": math.radians(190.0)}
+    return Intrinsics.from_fov(64, 48, fov[projection], projection)
 
 
 @pytest.mark.parametrize("projection", PROJECTIONS)
@@ -218,6 +219,9 @@ def rays_of(k: Intrinsics, attitude: NDArray[np.float64]) -> NDArray[np.float64]
     v, u = np.mgrid[: k.height, : k.width]
     x, y = (u - k.cx) / k.focal, (v - k.cy) / k.focal
     ahead, right = (np.cos(x), np.sin(x)) if k.cylindrical else (np.ones_like(x), x)
+    if k.projection == "fisheye":
+        off, plane = np.hypot(x, y), np.arctan2(y, x)
+        ahead, right, y = np.cos(off), np.sin(off) * np.cos(plane), np.sin(off) * np.sin(plane)
     rays: NDArray[np.float64] = np.stack([ahead, right, y], -1) @ quat_to_matrix(attitude).T
     return rays
 

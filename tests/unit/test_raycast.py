@@ -95,6 +95,11 @@ class Rays:
         x, y = (u - k.cx) / k.focal, (v - k.cy) / k.focal
         ahead, right = (np.cos(x), np.sin(x)) if k.projection == "cylindrical" else (x**0, x)
         camera = np.stack([ahead, right, y], -1)
+        if k.projection == "fisheye":
+            off, plane = np.hypot(x, y), np.arctan2(y, x)
+            aside = np.sin(off)
+            camera = np.stack([np.cos(off), aside * np.cos(plane), aside * np.sin(plane)], -1)
+            camera[off > math.radians(95.0)] = math.nan
         attitude = Rotation.from_quat(np.roll(scene.quaternion, -1)).as_matrix()
         self.d = camera.reshape(-1, 3) @ attitude.T
         self.o = np.array([*scene.position[:2], min(scene.position[2], -MIN_DEPTH_M)])
@@ -178,7 +183,7 @@ def brute_force(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     returned = np.isfinite(rays.t) & (rays.t <= scene.max_range)
     depth = np.where(returned, np.maximum(rays.t, MIN_DEPTH_M), 0.0)
     if inside:
-        depth[:] = MIN_DEPTH_M
+        depth[:] = np.where(np.isnan(rays.d[:, 0]), 0.0, MIN_DEPTH_M)
     return depth.reshape(k.height, k.width), rays.body.reshape(k.height, k.width)
 
 
@@ -230,12 +235,16 @@ def test_agrees_with_brute_force(projection: Projection, seed: int) -> None:
         scene = random_scene(rng)
         if projection == "cylindrical":
             scene = all_round(scene, rng)
+        elif projection == "fisheye":
+            k, fov = scene.intrinsics, rng.uniform(0.4, math.radians(190.0))
+            lens = Intrinsics.from_fov(k.width, k.height, fov, "fisheye")
+            scene = replace(scene, intrinsics=lens)
         depth, expected = scene.render(), brute_force(scene)[0]
         error = float(np.max(np.abs(depth - expected)))
         assert error < 1e-4, f"scene {number}: {error} m, {scene}"
         returns += int(np.count_nonzero(expected > MIN_DEPTH_M))
         escapes += int(np.count_nonzero(expected == 0.0))
-        inside += bool(np.all(expected == np.float64(MIN_DEPTH_M)))
+        inside += bool(np.all((expected == np.float64(MIN_DEPTH_M)) | (expected == 0.0)))
     # The scenes must not be trivial.
     assert returns > 15_000
     assert escapes > 3_000
@@ -516,6 +525,7 @@ def test_writes_into_the_image_of_a_batch() -> None:
         o.center,
         o.half_size,
         o.yaw,
+        None,
         None,
     )
     np.testing.assert_array_equal(batch[1], scene.render())

@@ -144,7 +144,7 @@ class FlightMessages:
         yield self._drawn(time_us, "/scene/vehicle", self._vehicle(VEHICLE, time_us))
         if self.flight.estimate is not None:
             yield self._drawn(time_us, "/scene/estimate", self._vehicle(ESTIMATE, time_us))
-        if not self._camera.intrinsics.cylindrical:
+        if self._camera.intrinsics.projection == "pinhole":
             yield self._drawn(time_us, "/camera/calibration", self._calibration(time_us))
 
     def _vehicle(self, frame: str, time_us: int) -> SceneUpdate:

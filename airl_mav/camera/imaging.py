@@ -1,0 +1,188 @@
+"""How a colour camera's image is formed: exposed while the vehicle moves, metered, noisy, coded.
+
+An exposure that takes time is the mean of images of shorter ones, from where vehicle and obstacles
+are then: its middle is the frame's stamp, and velocity and angular rates are those of that moment.
+A gain is light: the scene is drawn with all light times the gain, so that dark ones keep their
+shades. Light beyond white is cut in each of the shorter exposures. Then lens and sensor
+(`image_sensor`), and JPEG. The light of a grey pixel is that of its number.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.arena.appearance import LUMINANCE
+from airl_mav.arena.geometry import Arena
+from airl_mav.camera.image_sensor import (
+    LIGHT_OF,
+    Light,
+    codes_of,
+    demosaiced,
+    mosaic,
+    noisy,
+    vignette,
+)
+from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.jpeg import image_of, jpeg_of
+from airl_mav.camera.picture import grey, render_picture
+from airl_mav.camera.render import Motion, Mount, camera_pose, carried_on
+from airl_mav.core.constants import US_PER_MS, US_PER_S
+from airl_mav.core.streams import Stream, stream
+from airl_mav.profiles.camera import Camera
+from airl_mav.profiles.imaging import AutoExposure, Imaging
+
+MOST_METERED: Final = 5
+"""Images that a gain is settled by, at most: where all is white or black, one says little."""
+
+SETTLED: Final = 0.01
+"""A gain that is due to change by less than this share is settled."""
+
+LEAST_LIGHT: Final = 1e-5
+"""Of a dark image: a thirtieth of the least number in every pixel."""
+
+
+class Taken(NamedTuple):
+    """An image, as `Frame` has it."""
+
+    image: NDArray[Any]
+    jpeg: bytes | None
+
+
+class ImageFormation:
+    """Takes the images of one camera with a table `imaging`; its gain may follow the light."""
+
+    def __init__(self, camera: Camera) -> None:
+        """Take a camera of kind rgb or grey that has the table."""
+        assert camera.imaging is not None  # noqa: S101 - whoever makes one has looked
+        self._imaging: Imaging = camera.imaging
+        self._camera = Intrinsics.of(camera)
+        self._mount = Mount(
+            (camera.forward_m, 0.0, -camera.up_m), math.radians(camera.pitch_up_deg)
+        )
+        self._period_s = camera.period_us / US_PER_S
+        share = self._imaging.vignetting
+        self._through = vignette(self._camera, share)[..., None] if share else None
+        self.restart()
+
+    def restart(self) -> None:
+        """Begin an episode: the gain is that of the first image at once."""
+        self.gain: float | None = None
+        """That of the newest image; None: there is none yet."""
+        self._frame = 0
+
+    def take(self, arena: Arena, elapsed_us: int, motion: Motion, seed: int, frame: int) -> Taken:
+        """Return an image.
+
+        Args:
+            arena: What is seen.
+            elapsed_us: Time since the episode's start, at the middle of the exposure [µs].
+            motion: How the vehicle moves then.
+            seed: Of the episode.
+            frame: The image's number in the episode, by the camera's rate: frames that nobody
+                takes count, as of `noise.noisy_frame`.
+
+        Raises:
+            UsageError: The file of a mesh cannot be read, or is another one.
+        """
+        asked = self._imaging
+        off = _off_by(asked, seed)
+        if asked.auto_exposure is None:
+            self.gain = off * asked.gain
+        else:
+            self.gain = self._metered(arena, elapsed_us, motion, asked.auto_exposure, off, frame)
+        self._frame = frame
+        light = self._exposed(arena, elapsed_us, motion, self.gain)
+        return self._formed(light, self.gain, seed, frame)
+
+    def _exposed(self, arena: Arena, elapsed_us: int, motion: Motion, gain: float) -> Light:
+        """Return the light (h, w, channels) of an exposure."""
+        asked = self._imaging
+        count = asked.samples if asked.exposure_ms else 1
+        total: Light | None = None
+        for k in range(count):
+            since_us = round(US_PER_MS * asked.exposure_ms * ((k + 0.5) / count - 0.5))
+            light = LIGHT_OF[self._codes(arena, elapsed_us + since_us, motion, since_us, gain)]
+            total = light if total is None else total + light
+        assert total is not None  # noqa: S101 - there is one at least
+        return total if count == 1 else total * np.float32(1.0 / count)
+
+    def _codes(
+        self, arena: Arena, elapsed_us: int, motion: Motion, since_us: int, gain: float
+    ) -> NDArray[np.uint8]:
+        """Return the sRGB numbers (h, w, channels) of one moment, `since_us` after the stamp."""
+        position, quaternion = carried_on(motion, since_us / US_PER_S)
+        at, attitude = camera_pose(np.array(position), np.array(quaternion), self._mount)
+        centers = arena.centers_at(elapsed_us)
+        rgb = render_picture(arena, centers, self._camera, at, attitude, gain).rgb
+        return rgb if self._camera.kind == "rgb" else grey(rgb)[..., None]
+
+    def _metered(
+        self,
+        arena: Arena,
+        elapsed_us: int,
+        motion: Motion,
+        auto: AutoExposure,
+        off: float,
+        frame: int,
+    ) -> float:
+        """Return the gain of an image whose mean light shall be the target's, times `off`.
+
+        Light that is linear in the gain would be there at once; what is white or black is not.
+        """
+        settles = self.gain is None or auto.time_constant_s == 0.0
+        gain = 1.0 if settles or self.gain is None else self.gain
+        for _ in range(MOST_METERED if settles else 1):
+            mean = _mean_light(self._codes(arena, elapsed_us, motion, 0, gain))
+            due = min(
+                max(gain * off * auto.target / max(mean, LEAST_LIGHT), auto.least_gain),
+                auto.most_gain,
+            )
+            if not settles:
+                passed_s = (frame - self._frame) * self._period_s
+                share = -math.expm1(-passed_s / auto.time_constant_s)
+                return float(gain * (due / gain) ** share)
+            done = abs(due / gain - 1.0) < SETTLED
+            gain = due
+            if done:
+                break
+        return float(gain)
+
+    def _formed(self, light: Light, gain: float, seed: int, frame: int) -> Taken:
+        """Return the image that lens and sensor make of light (h, w, channels)."""
+        asked, channels = self._imaging, light.shape[2]
+        if self._through is not None:
+            light = light * self._through
+        if asked.bayer:
+            light = mosaic(light)
+        if asked.full_well_e is not None:
+            rng = stream(seed, Stream.PHOTONS, frame)
+            light = noisy(light, gain, asked.full_well_e, asked.read_noise_e, rng)
+        if asked.bayer:
+            light = demosaiced(np.minimum(light, np.float32(1.0)))
+        image: NDArray[Any] = codes_of(light)
+        if asked.jpeg_quality is None:
+            return Taken(image, None)
+        jpeg = jpeg_of(image, asked.jpeg_quality)
+        return Taken(image_of(jpeg, image.shape[0], image.shape[1], channels), jpeg)
+
+
+def _off_by(asked: Imaging, seed: int) -> float:
+    """Return the factor by which the light of an episode is off."""
+    if not asked.gain_spread_ev:
+        return 1.0
+    share = 2.0 * stream(seed, Stream.EXPOSURE).random() - 1.0
+    return float(2.0 ** (asked.gain_spread_ev * share))
+
+
+def _mean_light(codes: NDArray[np.uint8]) -> float:
+    """Return the mean luminance of sRGB or grey numbers (h, w, channels); 1 is white."""
+    weights = LUMINANCE if codes.shape[2] == 3 else np.ones(1)
+    mean = 0.0
+    for channel, weight in enumerate(weights.tolist()):
+        counts = np.bincount(codes[..., channel].ravel(), minlength=256)
+        mean += weight * float(counts @ LIGHT_OF.astype(np.float64)) / counts.sum()
+    return mean

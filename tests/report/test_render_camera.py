@@ -1,0 +1,100 @@
+"""`airl render --camera VEHICLE`: what the camera of a vehicle profile takes."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image, ImageSequence
+from rich.console import Console
+
+from airl_mav.arena.generate import generate
+from airl_mav.camera.imaging import ImageFormation
+from airl_mav.camera.render import Motion
+from airl_mav.cli.options import carry_out
+from airl_mav.core.errors import UsageError
+from airl_mav.core.frames import quat_from_euler
+from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.profiles.loading import load_profile
+from airl_mav.profiles.vehicle import load_vehicle
+from airl_mav.report.camera_taken import _rates
+from airl_mav.report.replay.runs import ReplayedRun
+from tests.support.run_demo import write_demo_run
+
+PROFILE = """
+base = "quad-rgb"
+description = "formed"
+[camera.imaging]
+exposure_ms = 20.0
+samples = 4
+full_well_e = 2000.0
+jpeg_quality = 80
+[camera.imaging.auto_exposure]
+"""
+
+
+@pytest.fixture
+def vehicle(tmp_path: Path) -> Path:
+    path = tmp_path / "formed.toml"
+    path.write_text(PROFILE)
+    return path
+
+
+def render(*words: str) -> None:
+    code = carry_out("airl render", "airl_mav.cli.render", list(words), console=Console(quiet=True))
+    assert code == 0
+
+
+def test_a_picture_is_that_of_the_moving_vehicle_s_camera(vehicle: Path, tmp_path: Path) -> None:
+    out = tmp_path / "x.png"
+    words = ("--yaw-deg", "30", "--speed-m-s", "6", "--yaw-rate-deg-s", "45", "--height-m", "2")
+    render("varied-looks", "--seed", "4", "--camera", str(vehicle), *words, "--out", str(out))
+    spec = load_profile("arenas", "varied-looks", ArenaSpec)
+    arena = generate(spec, 4, name="varied-looks", vehicle_width_m=0.55)
+    yaw = math.radians(30.0)
+    motion = Motion(
+        np.array([0.0, 0.0, -2.0]),
+        quat_from_euler(0.0, 0.0, yaw),
+        6.0 * np.array([math.cos(yaw), math.sin(yaw), 0.0]),
+        np.array([0.0, 0.0, math.radians(45.0)]),
+    )
+    wanted = ImageFormation(load_vehicle(str(vehicle)).camera).take(arena, 0, motion, 4, 0).image
+    with Image.open(out) as image:
+        np.testing.assert_array_equal(np.asarray(image), wanted)
+
+
+def test_a_film_has_the_pictures_of_that_camera(vehicle: Path, tmp_path: Path) -> None:
+    folder, _ = write_demo_run(tmp_path / "run", episodes=1, profile="dynamic-obstacles")
+    out = tmp_path / "flight.webp"
+    render(str(folder.path), "0", "--camera", str(vehicle), "--rate-hz", "2", "--out", str(out))
+    with Image.open(out) as image:
+        assert image.size == (64, 48)
+        assert sum(1 for _ in ImageSequence.Iterator(image)) > 2
+    # Rates by attitudes are those that lead from one to the next.
+    run = ReplayedRun(folder.path)
+    flight = run.flight(run.record(0))
+    path = flight.path
+    headings = np.unwrap([
+        math.atan2(2 * (q[0] * q[3] + q[1] * q[2]), 1 - 2 * (q[2] ** 2 + q[3] ** 2))
+        for q in path.quaternion
+    ])  # fmt: skip
+    at = len(headings) // 2
+    turned = (headings[at + 1] - headings[at - 1]) / (
+        1e-6 * (path.time_us[at + 1] - path.time_us[at - 1])
+    )
+    assert _rates(flight, int(path.time_us[at]))[2] == pytest.approx(turned, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("--camera", "quad-rgb", "--show", "depth"), "--show depth: with --camera"),
+        (("--camera", "quad-rgb", "--width-px", "64"), "--width-px 64: with --camera"),
+        (("--speed-m-s", "3"), "--speed-m-s 3(.0)?: without --camera"),
+    ],
+)
+def test_what_the_profile_says_is_not_asked_for(words: tuple[str, ...], told: str) -> None:
+    with pytest.raises(UsageError, match=told):
+        render("no-obstacles", *words)
