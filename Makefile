@@ -59,18 +59,23 @@ lint: $(ALL)  ## Format, lint, types, import contracts
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-# What every worker of the tests would compile for itself: kernels, and modules.
+# What every worker of the tests would compile for itself: kernels, and modules. Kernels need what
+# flies and nothing else; while pip installs the package once more, it is found by its place.
 .PHONY: kernels-plant kernels-twin modules
-kernels-plant kernels-twin: kernels-%: $(ALL)
-	$(BIN)/python scripts/compile_kernels.py $*
+kernels-plant kernels-twin: kernels-%: $(FLY)
+	PYTHONPATH=$(CURDIR) $(BIN)/python scripts/compile_kernels.py $*
 
 modules: $(ALL)
 	$(BIN)/python -m pytest --collect-only --quiet --quiet > $(VENV)/.collected
 
-# Two at a time, as mypy and a compiler are one thread each; the longest first.
+# Workers share the cores: threads of torch's that wait for each other would take them in vain.
+test nightly: export OMP_NUM_THREADS := 1
+
+# Two at a time, as pip, mypy and a compiler are one thread each. What flies is installed first: its
+# kernels are compiled while pip unpacks the rest, which is larger.
 .PHONY: test
-test: $(ALL)  ## Everything CI checks
-	@$(MAKE) --no-print-directory --jobs 2 --output-sync lint kernels-plant kernels-twin modules
+test: $(FLY)  ## Everything CI checks
+	@$(MAKE) --no-print-directory --jobs 2 --output-sync kernels-plant lint kernels-twin modules
 	$(BIN)/python -m pytest -n $(WORKERS) $(SPREAD) -m "not nightly" --durations 25
 
 .PHONY: nightly

@@ -16,7 +16,8 @@ from tests.support.mavlink_clients import Bench, RawClient
 
 # Derandomised: a 16-bit checksum lets one random frame in 65,536 pass, too many for a test to
 # depend on luck.
-LINKS = ("onboard", "gcs")
+LINKS = ("onboard", pytest.param("gcs", marks=pytest.mark.nightly))
+"""Of two links with one reader: the ground station's is fuzzed in the night."""
 
 # What the services read: the messages most worth distorting.
 HANDLED = (

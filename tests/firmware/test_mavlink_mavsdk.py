@@ -112,6 +112,7 @@ def fly(companion: Companion, pacer: Pacer) -> None:
     wait_for(lambda: not telemetry.armed() and not telemetry.in_air())
 
 
+@pytest.mark.nightly  # Over UDP: below; in memory: test_px4_walk.py.
 def test_a_whole_flight_in_memory() -> None:
     with mavsdk_over_memory() as (companion, pacer):
         fly(companion, pacer)

@@ -115,6 +115,7 @@ def test_memory_stays_bounded_where_nobody_collects_the_record() -> None:
     assert blocks_kept_by_two_minutes(recording=False) < 200
 
 
+@pytest.mark.nightly  # What is kept: test_simulation.py.
 def test_the_same_flight_recorded_keeps_its_samples() -> None:
     assert blocks_kept_by_two_minutes(recording=True) > 6_000
 

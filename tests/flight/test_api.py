@@ -84,7 +84,10 @@ def test_its_report_is_a_page(
     assert capfd.readouterr() == ("", "")
 
 
-@pytest.mark.parametrize("level", ["gym", "lockstep"])
+@pytest.mark.parametrize(
+    "level",
+    ["gym", pytest.param("lockstep", marks=pytest.mark.nightly)],  # test_evaluate_lockstep.py
+)
 def test_it_flies_what_the_command_flies_and_is_silent(
     level: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:

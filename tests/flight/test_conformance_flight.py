@@ -141,6 +141,7 @@ def test_a_detuned_vehicle_does_not_conform(tmp_path: Path) -> None:
     assert checks["auto-disarm"]["outcome"] == "pass"
 
 
+@pytest.mark.nightly  # What ends a flight is noted: test_conformance.py.
 @pytest.mark.slow
 @pytest.mark.xdist_group("rehearsal")
 @pytest.mark.timeout(300)

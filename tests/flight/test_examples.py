@@ -65,6 +65,7 @@ def test_faults_are_told(tmp_path: Path) -> None:
     assert "  uplink loss 0.3 at offboard" in text
 
 
+@pytest.mark.nightly  # Policies from a file: test_python_policy.py.
 def test_own_policy(tmp_path: Path) -> None:
     text = output_of("own_policy.py", tmp_path)
     assert len(re.findall(r"^seed \d: (success|collision|timeout), ", text, re.M)) == 2

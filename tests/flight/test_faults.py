@@ -314,6 +314,7 @@ def fly_in_thread(ports: TestPorts, policy: Any) -> tuple[threading.Thread, list
     return thread, results
 
 
+@pytest.mark.nightly  # In lockstep: test_lockstep.py.
 def test_hung_policy_is_stopped_then_leaves_offboard_then_lands(
     tmp_path: Path, ground: Ground
 ) -> None:
@@ -477,6 +478,7 @@ def test_silent_camera_is_named(tmp_path: Path, ground: Ground) -> None:
         thread.join()
 
 
+@pytest.mark.nightly  # In lockstep: test_limit_flights.py.
 def test_killed_firmware_is_a_lost_link(tmp_path: Path, ground: Ground) -> None:
     ports = choose_ports(ground.port)
     with firmware(tmp_path, ports) as vehicle, companion(tmp_path, ports) as pilot:

@@ -57,7 +57,9 @@ def test_a_late_take_off_is_not_cut_short() -> None:
         rig.until(lambda: rig.height > 1.5, 6.0)
 
 
-@pytest.mark.parametrize("share", [0.5, 0.65, 0.8, 1.25, 1.45])
+@pytest.mark.parametrize(
+    "share", [0.5, *(pytest.param(s, marks=pytest.mark.nightly) for s in (0.65, 0.8, 1.25)), 1.45]
+)
 def test_a_vehicle_of_another_weight_than_its_parameters_say(share: float) -> None:
     """MPC_THR_HOVER is that of the profile; the true one is this share of it."""
     body = quad().body
@@ -93,7 +95,7 @@ def test_arming_in_the_tick_of_the_disarming_starts_the_clock_anew() -> None:
         assert not disarmed(rig)
 
 
-@pytest.mark.parametrize("home_north", [0.0, 12.0])
+@pytest.mark.parametrize("home_north", [pytest.param(0.0, marks=pytest.mark.nightly), 12.0])
 def test_return_flies_home_and_lands(home_north: float) -> None:
     """Home is where the vehicle was armed, also on its second flight."""
     with flight(2, parameters={"RTL_RETURN_ALT": 8.0, "COM_DISARM_LAND": 0.2}) as rig:

@@ -47,7 +47,7 @@ def hover(rig: Rig) -> Hover:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.nightly)])
 def test_it_stays_where_it_hovers(seed: int) -> None:
     with flight(seed) as rig:
         flown = hover(rig)

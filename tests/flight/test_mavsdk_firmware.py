@@ -211,6 +211,7 @@ def pilot(sticks: ManualControl) -> Iterator[Callable[[float], None]]:
         holder.join()
 
 
+@pytest.mark.nightly  # The same calls in simulated time: test_px4_walk.py.
 def test_going_places_with_every_plugin(tmp_path: Path) -> None:
     """The part of the long walk over a real PX4 that goes places: same calls, same outcomes."""
     with client(tmp_path) as c:
@@ -327,6 +328,7 @@ def test_return_to_launch(tmp_path: Path) -> None:
         assert math.hypot(*c.gps()) < 1.5
 
 
+@pytest.mark.nightly  # The same calls in simulated time: test_px4_walk.py.
 def test_arming_before_it_is_ready_is_refused(tmp_path: Path) -> None:
     # Slow, so that there is time to ask before the estimator has converged.
     with client(tmp_path, speed=0.25) as c:
@@ -335,6 +337,7 @@ def test_arming_before_it_is_ready_is_refused(tmp_path: Path) -> None:
         c.firmware.wait_for_text("Arming denied: Resolve system health failures first")
 
 
+@pytest.mark.nightly  # The same calls in simulated time: test_px4_walk.py.
 def test_parameters_and_rates(tmp_path: Path) -> None:
     with client(tmp_path) as c:
         assert c.param.get_param_int("COM_OBL_RC_ACT") == 0

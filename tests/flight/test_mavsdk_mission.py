@@ -29,6 +29,7 @@ def place(c: Client, north: float, east: float) -> MissionItem:
     )
 
 
+@pytest.mark.nightly  # In simulated time: test_px4_walk.py.
 def test_upload_start_pause_resume_jump_and_finish(tmp_path: Path) -> None:
     with client(tmp_path) as c:
         mission: Mission = c.companion.plugin(Mission)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
-import sys
 from collections import Counter
 from dataclasses import dataclass
 from itertools import pairwise
@@ -19,8 +17,9 @@ from pymavlink import mavutil
 from airl_mav.latency.samplers import build_sampler
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.profiles.computer import load_computer
+from tests.support.command_line import airl
 from tests.support.ports import choose_ports
-from tests.support.processes import ROOT, SITL, SITL_WITHOUT_REPORT, running, write_arena
+from tests.support.processes import SITL, SITL_WITHOUT_REPORT, running, write_arena
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("rehearsal"), pytest.mark.timeout(300)]
 
@@ -255,17 +254,9 @@ def tables(output: str) -> list[str]:
 
 def test_report_again_says_the_same(done: Done) -> None:
     html = (done.folder / "report.html").read_bytes()
-    again = subprocess.run(
-        [sys.executable, "-m", "airl_mav.cli.main", "report", str(done.folder)],
-        env={"PYTHONPATH": str(ROOT), "COLUMNS": "200", "HOME": str(done.folder.parent)},
-        cwd=done.folder.parent,
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
-    assert again.returncode == 0, again.stderr
-    assert tables(again.stdout) == tables(done.output)
+    code, again = airl("report", str(done.folder), width=200)
+    assert code == 0, again
+    assert tables(again) == tables(done.output)
     assert (done.folder / "report.html").read_bytes() == html
     text = "\n".join(tables(done.output))
     for word in ("Decision latency", "end to end", "Quality of flight", "success rate", "100 %"):

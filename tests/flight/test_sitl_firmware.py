@@ -107,6 +107,7 @@ def test_a_rehearsal_with_px4_that_dies_once(tmp_path: Path, px4_instance: int) 
         assert (run / name).read_text(encoding="utf-8") == ""
 
 
+@pytest.mark.nightly  # test_real_firmware_parts.py finds each.
 def test_a_wrong_motor_order_is_found_on_the_ground(tmp_path: Path, px4_instance: int) -> None:
     build = write_build(tmp_path / "px4", "--fault", "motors")
     with running(px4(build, px4_instance), tmp_path) as process:

@@ -323,6 +323,7 @@ def episodes_of(folder: Path) -> dict[int, dict[str, Any]]:
     return {episode["seed"]: episode for episode in lines}
 
 
+@pytest.mark.nightly  # As much is closed by test_gap_command.py.
 def test_an_untrained_for_latency_costs_little_once_it_is_compensated(tmp_path: Path) -> None:
     """The paper's 396 ms: of 60 seeds `static-obstacles` loses few, and flies hardly longer."""
     words = ["static-obstacles", "--latencies", "11ms", "396ms", "--compensated"]

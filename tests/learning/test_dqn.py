@@ -267,8 +267,8 @@ class Endless(ToyFleet):
 @pytest.mark.parametrize(
     ("n_step", "dies"),
     [
-        (1, False),
         (3, True),
+        pytest.param(1, False, marks=pytest.mark.nightly),
         pytest.param(1, True, marks=pytest.mark.nightly),
         pytest.param(3, False, marks=pytest.mark.nightly),
     ],

@@ -105,6 +105,9 @@ def test_depth_is_bit_for_bit_that_of_the_rehearsal(worlds: list[Arena]) -> None
     assert np.array_equal(boxes[-1], out[-1])
 
 
+# Each half is seen in every run: the twin's meshes above, its colours without them in
+# test_colour_flight.py, a mesh in colour in test_meshes_seen.py. Together they compile for minutes.
+@pytest.mark.nightly
 @pytest.mark.timeout(600)  # compiles kernels, on a busy machine for minutes
 def test_colour_is_bit_for_bit_that_of_the_rehearsal(worlds: list[Arena]) -> None:
     n = len(worlds)

@@ -59,7 +59,8 @@ def flown_by(name: ExpertName, seeds: Sequence[int], **knobs: Any) -> list[Episo
     [
         ("static-obstacles", "arc-25", 0.97),
         ("dynamic-obstacles", "velocity", 0.97),
-        ("crowded", "velocity", 0.95),
+        # Both at once.
+        pytest.param("crowded", "velocity", 0.95, marks=pytest.mark.nightly),
     ],
 )
 def test_the_planner_is_safer_and_faster_than_what_it_teaches(

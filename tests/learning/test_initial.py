@@ -59,7 +59,9 @@ def test_ppo_goes_on_from_what_an_expert_has_taught(tmp_path: Path) -> None:
     environment = TINY["environment"] | {"actions": "velocity"}
     taught = TINY | {"environment": environment, "algorithm": {"name": "bc", "expert": "greedy"}}
     run.train(TrainingConfig.model_validate(taught), tmp_path / "taught", name="taught")
-    algorithm = {"name": "ppo", "learning_rate": 1e-12, "options": {"log_std_init": -1.7}}
+    # Rollouts no longer than the training.
+    options = {"log_std_init": -1.7, "n_steps": 20, "n_epochs": 2}
+    algorithm = {"name": "ppo", "learning_rate": 1e-12, "batch_size": 20, "options": options}
     changes = {"algorithm": algorithm, "initial": str(tmp_path / "taught")}
     run.train(TrainingConfig.model_validate(taught | changes), tmp_path / "on", name="on")
     ours, theirs = weights(tmp_path / "on"), weights(tmp_path / "taught")

@@ -43,7 +43,7 @@ from tests.support.scene import has_drawn
 
 SHORT = """
 description = "a short one"
-steps = 2_000
+steps = 1_000
 vehicles = 8
 [environment]
 arena = "dynamic-obstacles"
@@ -53,7 +53,7 @@ latency = ["lognormal:150ms,30ms"]
 [algorithm]
 learning_starts = 300
 [selection]
-every = 1_000
+every = 500
 episodes = 4
 """
 
@@ -215,7 +215,7 @@ def test_a_training_that_goes_on_shows_whole_episodes() -> None:
 @pytest.mark.xdist_group("chromium")
 def test_a_browser_shows_the_training(tmp_path: Path) -> None:
     pytest.importorskip("viser")
-    (tmp_path / "long.toml").write_text(SHORT.replace("2_000", "10_000_000"), encoding="utf-8")
+    (tmp_path / "long.toml").write_text(SHORT.replace("1_000", "10_000_000"), encoding="utf-8")
     words = ["-m", "airl_mav.cli.main", "train", "long.toml", "--view"]
     with browser(tmp_path) as page, running([*words, "--out", "run"], tmp_path) as training:
         page.resize(900, 600)

@@ -16,6 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from matplotlib import get_cachedir
 from pymavlink.dialects.v20 import common as dialect
 
 from tests.support.ports import LOOPBACK
@@ -57,7 +58,8 @@ def run_alone(program: str, folder: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, "-W", "error", "-c", program],
         cwd=folder,
-        env={"PYTHONPATH": str(ROOT), "HOME": str(folder)},
+        # matplotlib lists the fonts of this machine once for each place where it may keep the list.
+        env={"PYTHONPATH": str(ROOT), "HOME": str(folder), "MPLCONFIGDIR": get_cachedir()},
         capture_output=True,
         text=True,
         timeout=120,
