@@ -105,6 +105,7 @@ class PlantRangefinder:
             half_size,
             yaw,
             self._meshes,
+            None,
         )
         depth = self._image.item()
         return depth if depth > 0.0 else None
