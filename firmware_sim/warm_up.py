@@ -20,7 +20,12 @@ from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import DEFAULT_PLANT, Aircraft, PlantName
+from firmware_sim.autopilot.error_state import INITIAL_SIGMA, new_state
+from firmware_sim.autopilot.filter_kernel import KernelFilter
+from firmware_sim.autopilot.range_finder import Aids, RangeFinder
+from firmware_sim.autopilot.terrain_filter import TerrainFilter
 from firmware_sim.autopilot.yaw_estimator import YawEstimator
+from firmware_sim.interfaces import DistanceReading
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from firmware_sim.mavlink.link import gcs_link, onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
@@ -31,6 +36,9 @@ LONGEST_TICKS = 1300
 
 ARMED_TICKS = 60
 """Enough for the vehicle to spin up, and for every stream to tell of it."""
+
+GROUND_STEPS, GROUND_STEP_US = 30, 50_000
+"""Ranges on the ground, and as many in the air: more than EKF2_RNG_QLTY_T."""
 
 HOVER = np.array([0.0, 0.0, -GRAVITY_M_S2])
 """Specific force (3,) of a vehicle that hovers level, FRD [m/s²]."""
@@ -62,6 +70,7 @@ def warm_up(vehicle: VehicleProfile, plant: PlantName = DEFAULT_PLANT) -> None:
         simulation.close()
     _fly_every_kind(autopilot.parameters.value)
     _fuse_in_the_air()
+    _measure_the_ground(autopilot.parameters.value)
 
 
 def _fly_every_kind(value: Callable[[str], float]) -> None:
@@ -80,3 +89,16 @@ def _fuse_in_the_air() -> None:
     estimator = YawEstimator()
     estimator.feel(np.zeros(3), HOVER)
     estimator.observe(np.zeros(3), 0.5, np.zeros(3), flying=True)
+
+
+def _measure_the_ground(value: Callable[[str], float]) -> None:
+    """Take ranges on the ground and in the air: any client may send some at any time."""
+    state = new_state()
+    terrain = TerrainFilter(KernelFilter(np.diag(INITIAL_SIGMA**2), np.zeros(len(INITIAL_SIGMA))))
+    finder = RangeFinder(value, state, terrain, 0)
+    aids = Aids(horizontal=True, vertical_speed=True, height_us=0)
+    for step in range(1, 2 * GROUND_STEPS):
+        now_us = step * GROUND_STEP_US
+        terrain.predict(state, np.zeros(3), HOVER)
+        finder.take(DistanceReading(0.5, 0.1, 12.0), now_us, 1)
+        finder.step(now_us, lambda: aids, flying=step > GROUND_STEPS)

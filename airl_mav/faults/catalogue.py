@@ -80,7 +80,7 @@ STANDS: frozenset[End] = frozenset({"landed", "flying"})
 
 FITTED_CASES: tuple[Case, ...] = (
     Case("rangefinder off"),
-    Case("rangefinder stuck", STANDS, frozenset[End]({"not armed", *STANDS})),
+    Case("rangefinder stuck", STANDS, frozenset({"not armed", "landed", "flying"})),
     Case("rangefinder noise 5x"),
     Case("rangefinder bias 0.5m"),
 )

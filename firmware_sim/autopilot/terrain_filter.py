@@ -84,12 +84,26 @@ class TerrainFilter:
 
     def fuse(self, state: Vector, innovation: Vector, h: Vector, variance: Vector) -> float:
         """Correct the state by a measurement that is none of the ground, unless it fails."""
-        spread = self._inner.covariance @ h.T
-        total = h @ spread + np.diag(variance)
+        p = self._inner.covariance
+        if len(h) == 1:
+            # Most are: the same without what arrays cost.
+            row = h[0]
+            before = p @ row
+            total = float(row @ before) + variance.item(0)
+            ratio = self._inner.fuse(state, innovation, h, variance)
+            if ratio <= 1.0:
+                by_one = float(row @ self.cross)
+                weight = by_one / total
+                self.down += weight * innovation.item(0)
+                self.variance -= by_one * weight
+                self.cross = self.cross - before * weight
+            return ratio
+        spread = p @ h.T
+        totals = h @ spread + np.diag(variance)
         ratio = self._inner.fuse(state, innovation, h, variance)
         if ratio <= 1.0:
             by_ground = h @ self.cross
-            weights = np.linalg.solve(total, by_ground)
+            weights = np.linalg.solve(totals, by_ground)
             self.down += float(weights @ innovation)
             self.variance -= float(by_ground @ weights)
             self.cross = self.cross - spread @ weights

@@ -17,6 +17,8 @@ its estimator waits for the next [µs]."""
 
 _CM, _CM2 = 1e2, 1e4
 _FIRST = 0
+_LASER, _KINDS = 0, (0, 1, 2)
+"""MAV_DISTANCE_SENSOR: laser, ultrasound and infrared; any other is told as a laser."""
 _NO_FIELD_OF_VIEW = (0.0, 0.0)
 _NO_QUATERNION = (0.0, 0.0, 0.0, 0.0)
 _QUALITY_NOT_TOLD = 0
@@ -32,7 +34,7 @@ def distance_sensor(state: AutopilotState) -> Values | None:
         _whole(told.least_m * _CM),
         _whole(told.greatest_m * _CM),
         _whole(told.distance_m * _CM),
-        told.kind,
+        told.kind if told.kind in _KINDS else _LASER,
         _FIRST,
         told.orientation,
         units.saturate(math.floor(told.variance_m2 * _CM2), 0, 255, 0),
