@@ -30,6 +30,7 @@ from firmware_sim.mavlink.link import onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.pacing import Unpaced
 from firmware_sim.simulation import EpisodeSetup
+from tests.support.flown_here import flown_here
 
 ANSWER = Topic("answer", ("float[3] xyz", "int16_t number", "bool right", "double exact"))
 
@@ -148,7 +149,8 @@ def test_intervals_are_met_by_the_grid() -> None:
 def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, ULog]:
     """A flight in lockstep, and its log."""
     folder = tmp_path_factory.mktemp("flown") / "run"
-    rehearse(Scenario(episodes=1, level="lockstep", tlogs=True, workers=1), out=folder)
+    with flown_here():
+        rehearse(Scenario(episodes=1, level="lockstep", tlogs=True, workers=1), out=folder)
     return folder, ULog(str(folder / "flight-000.ulg"))
 
 

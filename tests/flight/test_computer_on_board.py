@@ -10,6 +10,7 @@ from airl_mav.rehearsal.run_folder import LoadedRun, load
 from airl_mav.report.arenas import vehicle_of
 from airl_mav.report.run_summary import summarize_run
 from airl_mav.report.run_tables import quality_table, setup_rows
+from tests.support.flown_here import flown_here
 
 FURNACE = """
 description = "a furnace"
@@ -36,10 +37,12 @@ def runs(
             policy="static-obstacles",
             level=request.param,
             episodes=1,
+            workers=1,
             computer=str(computer),
             battery_charge=0.2,
         )
-        rehearse(scenario, out=out)
+        with flown_here():
+            rehearse(scenario, out=out)
         runs[name] = load(out)
     return runs
 

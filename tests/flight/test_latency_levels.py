@@ -14,12 +14,13 @@ from airl_mav import rehearse
 from airl_mav.core.constants import TICK_US
 from airl_mav.rehearsal.run_folder import LoadedRun, load
 from airl_mav.scenario.model import LevelName, Scenario
+from tests.support.flown_here import flown_here
 from tests.support.ports import choose_ports
 from tests.support.processes import ROOT, SITL_WITHOUT_REPORT
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("latency-levels")]
 
-POLICY, ARENA, EPISODES, SEED = "no-obstacles", "no-obstacles", 3, 700
+POLICY, ARENA, EPISODES, SEED = "no-obstacles", "no-obstacles", 2, 700
 
 TRACE_MS = [40.0 + 3.0 * k for k in range(101)]
 """A ramp: every value tells its place, and neighbours are neighbours."""
@@ -43,7 +44,8 @@ def fly(level: LevelName, trace: Path, out: Path, draw: int = 0) -> LoadedRun:
         latency_seed=draw,
         workers=1,
     )
-    rehearse(scenario, out=out)
+    with flown_here():
+        rehearse(scenario, out=out)
     return load(out)
 
 

@@ -10,6 +10,7 @@ import sys
 import time
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -22,12 +23,14 @@ from airl_mav.policy.learned import load_learned
 from airl_mav.policy.observation_spec import Encoded
 from airl_mav.profiles.loading import list_profiles, load_profile
 from airl_mav.rehearsal import lock
+from airl_mav.rehearsal.run_folder import load
 from airl_mav.training import run
 from airl_mav.training.config import TrainingConfig, check_fields
 from airl_mav.training.request import TrainRequest
 from airl_mav.training.run import nominal
 from airl_mav.training.store import TrainingFolder
-from tests.support.command_line import airl
+from tests.support.command_line import airl, option_words
+from tests.support.flown_here import flown_here
 from tests.support.processes import ROOT, SITL_WITHOUT_REPORT, allow_interrupt, wait_until
 
 SHORT = """
@@ -172,6 +175,14 @@ def test_programs_read_lines(short: Path, tmp_path: Path) -> None:
     # Trained to the end already: quiet says where the result lies, and nothing else.
     code, text = airl("train", str(config), "--out", str(out), "--resume", "--quiet")
     assert [line.split()[0] for line in text.splitlines()] == ["best", "policy", "folder"]
+    # What was exported flies through MAVSDK, well or not.
+    words = option_words(level="lockstep", episodes=1, workers=1, time_limit_s=5.0)
+    with flown_here(), patch("airl_mav.cli.evaluate.show_report"):
+        code, _ = airl("evaluate", str(out / "policy"), *words, "--out", str(tmp_path / "flight"))
+    assert code == 0
+    flown = load(tmp_path / "flight")
+    assert flown.episodes[0].notes == ()
+    assert (flown.latency[0]["accepted_us"] > 0).sum() >= 4
 
 
 @pytest.mark.nightly
@@ -224,6 +235,7 @@ def test_two_do_not_train_in_one_folder(tmp_path: Path, monkeypatch: pytest.Monk
         run.train(config, tmp_path / "run", name="one")
 
 
+@pytest.mark.nightly  # What a short training exports flies: test_programs_read_lines.
 @pytest.mark.slow
 @pytest.mark.timeout(400)
 def test_learns_exports_and_flies(tmp_path: Path) -> None:

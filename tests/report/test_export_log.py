@@ -31,6 +31,7 @@ from airl_mav.report.export_log.ulog_log import row, samples
 from airl_mav.report.recorded_flight import episode_of
 from airl_mav.report.replay.runs import ReplayedRun
 from tests.support.command_line import airl, option_words
+from tests.support.flown_here import flown_here
 from tests.support.mcap_kit import ReadMcap, distances_to, read_mcap, turn_of, xyz
 
 ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
@@ -55,7 +56,8 @@ def gym(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def lockstep(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("lockstep") / "run"
     asked: dict[str, Any] = {"arena": "static-obstacles", "episodes": 1, "time_limit_s": 6.0}
-    return fly(out, level="lockstep", workers=1, tlogs=True, **asked)
+    with flown_here():
+        return fly(out, level="lockstep", workers=1, tlogs=True, **asked)
 
 
 @pytest.fixture(scope="module", params=["gym", "lockstep"])
