@@ -95,17 +95,14 @@ def test_a_seed_is_a_flight_whatever_else_was_flown_before() -> None:
 def test_a_seed_is_a_flight_in_every_process() -> None:
     code = "from tests.firmware import test_simulation as t; print(t.digest_of_a_flight(5))"
     root = Path(__file__).parents[2]
-    runs = [
-        subprocess.run(
-            [sys.executable, "-c", code],
-            env={**os.environ, "PYTHONPATH": f"{root}", "PYTHONHASHSEED": seed},
-            stdout=subprocess.PIPE,
-            check=True,
-        )
-        for seed in ("1", "2")
-    ]
-    digests = {run.stdout.decode().split()[-1] for run in runs}
-    assert digests == {digest_of_a_flight(5)}
+    # Another order of sets and dictionaries of strings than in this process, for all we know.
+    run = subprocess.run(
+        [sys.executable, "-c", code],
+        env={**os.environ, "PYTHONPATH": f"{root}", "PYTHONHASHSEED": "1"},
+        stdout=subprocess.PIPE,
+        check=True,
+    )
+    assert run.stdout.decode().split()[-1] == digest_of_a_flight(5)
 
 
 @pytest.mark.nightly

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-from collections.abc import Iterator
 from contextlib import suppress
 from functools import partial
 from importlib.util import find_spec
@@ -37,13 +36,20 @@ SMALL = (
 )
 """Long enough to be killed in."""
 
-PLACE = "--out"
+COMMAND, PLACE = ("-m", "airl_mav.cli.main", "sweep"), "--out"
 
 
 def sweep(folder: Path, *options: str) -> list[str]:
     """Return the words of a sweep of `SMALL` into `folder`/out."""
     path = write_sweep_file(folder, SMALL)
-    return ["-m", "airl_mav.cli.main", "sweep", f"{path}", PLACE, "out", *options]
+    return [*COMMAND, f"{path}", PLACE, f"{folder / 'out'}", *options]
+
+
+def swept(folder: Path, *options: str) -> str:
+    """Carry out a sweep in this process; return what it printed."""
+    code, text = airl("sweep", *sweep(folder, *options)[len(COMMAND) :])
+    assert code == 0, text
+    return text
 
 
 def outcome(folder: Path) -> dict[str, Any]:
@@ -86,12 +92,10 @@ def checkpointed(folder: Path, before: frozenset[str] = frozenset()) -> frozense
 
 
 @pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("undisturbed")
-    with running(sweep(folder, "--workers", "1"), folder) as process:
-        assert process.wait(PATIENCE_S * 2) == 0, process.text()
-        (folder / "said").write_text(process.text(), encoding="utf-8")
-        yield folder
+    (folder / "said").write_text(swept(folder, "--workers", "1"), encoding="utf-8")
+    return folder
 
 
 def test_a_sweep_trains_judges_and_tells_all(undisturbed: Path) -> None:
@@ -134,11 +138,10 @@ def test_a_network_is_judged_as_airl_evaluate_judges_it(undisturbed: Path) -> No
 
 def test_started_again_it_shows_what_it_has_and_trains_nothing(undisturbed: Path) -> None:
     before = outcome(undisturbed)
-    with running(sweep(undisturbed, "--computer", "ras-pi-4"), undisturbed) as process:
-        assert process.wait() == 0, process.text()
-        assert f"{TRIALS} of {TRIALS} ended" in process.text()
-        assert "t2, estimated" in process.text()
-        assert f"seed {SEED}  success" not in process.text()
+    said = swept(undisturbed, "--computer", "ras-pi-4")
+    assert f"{TRIALS} of {TRIALS} ended" in said
+    assert "t2, estimated" in said
+    assert f"seed {SEED}  success" not in said
     assert outcome(undisturbed) == before
 
 
