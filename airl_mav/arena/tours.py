@@ -69,13 +69,13 @@ def draw_tours(
         walls.half,
         low,
         high,
-        max(gap_m, kind.clearance_m),
+        float(max(gap_m, kind.clearance_m)),
         kind.clearance_m,
-        kind.leg_max_m,
+        float(kind.leg_max_m),
         slowest,
         fastest,
         kind.dwell_s,
-        kind.tour_min_s,
+        float(kind.tour_min_s),
     )
     way = points.tolist()
     # One too many between two tours; not the kernel's hypot, whose last bit is the platform's.

@@ -85,7 +85,8 @@ def latency_figure(stage: Stage, samples: Samples, summary: Summary) -> theme.Pi
                 at_us / US_PER_MS, level, "o", ms=4, color=theme.MARK, clip_on=False, zorder=3
             )
     theme.label_axes(top, y="decisions", title=stage.title)
-    top.set_title("   ".join(marks), loc="right", fontsize=8.5, color=theme.MARK, pad=6)
+    told = "   ".join(marks)
+    top.set_title(told, loc="right", y=1.0, fontsize=8.5, color=theme.MARK, pad=6)
     top.yaxis.set_major_locator(MaxNLocator(3, integer=True))
     theme.label_axes(bottom, f"ms, n = {summary.n:,}", "share [%]")
     bottom.set_yticks([0, 50, 100])

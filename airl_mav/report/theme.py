@@ -134,6 +134,9 @@ def stacked_axes(
     """
     figure = _blank(width_in, height_in, None)
     axes = figure.subplots(rows, 1, sharex=True, squeeze=False, **options)[:, 0]
+    for ax in axes:
+        # By its height, or each drawing measures all ticks for what stands between axes and title.
+        ax.set_title("", y=1.0)
     inner = height_in - margins.bottom - margins.top - (rows - 1) * margins.between
     figure.subplots_adjust(
         left=margins.left / width_in,
@@ -213,7 +216,7 @@ def label_axes(ax: Axes, x: str = "", y: str = "", title: str = "") -> None:
     if y:
         ax.set_ylabel(y, fontsize=8.5, color=MUTED)
     if title:
-        ax.set_title(title, loc="left", fontsize=10.5, color=INK, pad=6)
+        ax.set_title(title, loc="left", y=1.0, fontsize=10.5, color=INK, pad=6)
 
 
 def logarithmic(ax: Axes, axis: Literal["x", "y"]) -> None:

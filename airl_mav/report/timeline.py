@@ -176,9 +176,10 @@ def _draw_stage(ax: Axes, stage: Stage, durations: Samples) -> None:
     ax.plot(x, middle[1], color=theme.SERIES, lw=0.9, zorder=2.5)
     limit = fence(found)
     _mark_outliers(ax, there, found, limit)
-    ax.set_title(stage.title, loc="left", fontsize=9, color=theme.INK, pad=3)
+    ax.set_title(stage.title, loc="left", y=1.0, fontsize=9, color=theme.INK, pad=3)
     if limit is not None:
-        ax.set_title(_outlier_text(limit), loc="right", fontsize=8, color=theme.MARK, pad=3)
+        text = _outlier_text(limit)
+        ax.set_title(text, loc="right", y=1.0, fontsize=8, color=theme.MARK, pad=3)
     ax.set_ylabel("ms", fontsize=8, color=theme.MUTED)
     ax.yaxis.set_major_locator(MaxNLocator(3))
     if long_tail(np.sort(found) / US_PER_MS):

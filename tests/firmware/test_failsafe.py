@@ -257,7 +257,7 @@ def test_offboard_needs_setpoints() -> None:
 # --- arming
 
 
-@pytest.mark.parametrize("wait_s", [2.0, 5.0])
+@pytest.mark.parametrize("wait_s", [pytest.param(2.0, marks=pytest.mark.nightly), 5.0])
 def test_disarms_after_landing(wait_s: float) -> None:
     with flight(SEED, parameters={"COM_DISARM_LAND": wait_s}) as rig:
         rig.take_off(2.5, settle_s=0.0)
@@ -270,7 +270,7 @@ def test_disarms_after_landing(wait_s: float) -> None:
         assert rig.mode is Mode.HOLD
 
 
-@pytest.mark.parametrize("wait_s", [10.0, 3.0])
+@pytest.mark.parametrize("wait_s", [pytest.param(10.0, marks=pytest.mark.nightly), 3.0])
 def test_disarms_without_take_off(wait_s: float) -> None:
     with flight(SEED, parameters={"COM_DISARM_PRFLT": wait_s}) as rig:
         rig.arm()
@@ -473,7 +473,7 @@ def test_the_user_flies_on_in_spite_of_the_battery() -> None:
 # --- ground station
 
 
-@pytest.mark.parametrize("limit_s", [10.0, 5.0])
+@pytest.mark.parametrize("limit_s", [pytest.param(10.0, marks=pytest.mark.nightly), 5.0])
 def test_ground_station_lost_and_regained(limit_s: float) -> None:
     lost, back = "Connection to ground station lost", "GCS connection regained"
     with flight(SEED, parameters={"COM_DL_LOSS_T": limit_s}) as rig:

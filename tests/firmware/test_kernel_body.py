@@ -85,7 +85,7 @@ def test_on_the_floor_it_moves_as_pybullet_s_body() -> None:
     assert float(turned.magnitude()) < math.radians(0.1)
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.nightly)])
 def test_it_hits_first_what_pybullet_s_body_hits_first(seed: int) -> None:
     """Thrown at moving obstacles, among thirty more, and to the tick but for a few."""
     place = crowd(seed)

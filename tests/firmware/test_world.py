@@ -154,7 +154,7 @@ class PlainWorld:
         return hits
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.nightly)])
 def test_what_is_hit_and_when_is_as_in_plain_pybullet(seed: int) -> None:
     place = crowd(seed)
     bullet = Aircraft(plant="pybullet")

@@ -22,6 +22,7 @@ from airl_mav.report import shown_flights
 from airl_mav.report.comparison import show
 from tests.support.campaign_kit import same_runs
 from tests.support.command_line import airl, option_words
+from tests.support.page_alone import page_alone
 
 GYM: dict[str, Any] = {"policy": "greedy", "arena": "no-obstacles", "seed": 20}
 
@@ -78,7 +79,8 @@ def test_its_report_is_a_page(
     flown: Run, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(shown_flights, "MAX_PICTURED", 0)
-    page = flown.report()
+    with page_alone():
+        page = flown.report()
     assert page == flown.path / "report.html"
     assert page.read_text(encoding="utf-8").rstrip().endswith("</html>")
     assert capfd.readouterr() == ("", "")
@@ -223,7 +225,8 @@ def test_a_run_of_an_earlier_version_is_read_but_not_gone_on_with(
 
 def test_policies_in_arenas(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     arenas = ("no-obstacles", "static-obstacles")
-    found = evaluate(asked(episodes=2), ("greedy",), arenas, out=tmp_path / "table")
+    with page_alone():
+        found = evaluate(asked(episodes=2), ("greedy",), arenas, out=tmp_path / "table")
     assert capfd.readouterr() == ("", "")
     assert list(found.runs) == [f"greedy-{arena}" for arena in arenas]
     assert found.page.exists()
@@ -241,7 +244,8 @@ def test_the_latency_curve(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
         seed=20,
         out=out,
     )
-    code, text = airl("degrade", "greedy", *words)
+    with page_alone():
+        code, text = airl("degrade", "greedy", *words)
     assert code == 0
     for name in ("degradation.json", "degradation.html", "degradation.md"):
         assert (out / name).stat().st_size > 1000

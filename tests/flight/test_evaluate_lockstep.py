@@ -35,6 +35,7 @@ from tests.support.campaign_kit import same_runs
 from tests.support.command_line import airl, option_words
 from tests.support.flown_here import flown_here
 from tests.support.linear_policy import write_linear
+from tests.support.page_alone import page_alone
 from tests.support.processes import Running, has_ended, running, wait_until
 from tests.support.worker_jobs import PaperFlier
 
@@ -66,7 +67,8 @@ def _few_pictures() -> Iterator[None]:
 def reference(tmp_path_factory: pytest.TempPathFactory) -> tuple[LoadedRun, str]:
     """One worker, undisturbed; and what was printed."""
     out = tmp_path_factory.mktemp("lockstep") / "one"
-    code, text = evaluate("greedy", workers=1, page=True, out=out)
+    with page_alone():
+        code, text = evaluate("greedy", workers=1, page=True, out=out)
     assert code == 0
     return load(out), text
 

@@ -101,6 +101,7 @@ def test_a_cell_counts_its_ends_and_marks_what_is_not_documented() -> None:
     assert Cell("baro off", "hold", (flight("not armed"),)).unexpected
 
 
+@pytest.mark.nightly  # Nor of any other jobs: test_executors.py, test_campaign.py.
 def test_workers_change_no_result() -> None:
     alone = fly_matrix(quad(), ("baro off",), ("landing",), (1, 2))
     assert fly_matrix(quad(), ("baro off",), ("landing",), (1, 2), workers=2) == alone

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +17,16 @@ from airl_mav.rehearsal.run_folder import FlownEpisode
 from airl_mav.report import shown_flights
 from airl_mav.report.comparison.model import load_comparison
 from tests.support.command_line import airl, option_words
+from tests.support.page_alone import page_alone
 
 GREEDY = ("greedy", *option_words(arena="no-obstacles", seed=20))
 
 
 @pytest.fixture(autouse=True)
-def _without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+def _without_pictures(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.setattr(shown_flights, "MAX_PICTURED", 0)
+    with page_alone():
+        yield
 
 
 def lines_of(text: str) -> list[dict[str, Any]]:

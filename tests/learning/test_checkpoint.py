@@ -124,14 +124,29 @@ def test_a_run_goes_on_in_another_process_bit_for_bit(tmp_path: Path) -> None:
     assert_same(expected, dict(np.load(out)))
 
 
-@pytest.mark.parametrize("name", sorted(FIELDS.keys() - {"ppo"}))
+# One of each kind; the others keep what they learn from as one of these does.
+EVERY_TIME = {"dqn", "qr-dqn", "recurrent-ppo", "sac"}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *sorted(EVERY_TIME),
+        *(
+            pytest.param(name, marks=pytest.mark.nightly)
+            for name in sorted(FIELDS.keys() - EVERY_TIME - {"ppo"})
+        ),
+    ],
+)
 def test_other_learners_go_on_bit_for_bit(name: str, tmp_path: Path) -> None:
     expected = straight(name, tmp_path / "checkpoints")
     random.random(), np.random.rand(), torch.rand(1)  # noqa: NPY002
     assert_same(expected, resume(name, tmp_path / "checkpoints"))
 
 
-@pytest.mark.parametrize("name", ["ppo", "recurrent-ppo", "sac"])
+@pytest.mark.parametrize(
+    "name", ["ppo", pytest.param("recurrent-ppo", marks=pytest.mark.nightly), "sac"]
+)
 def test_noise_that_depends_on_the_state_goes_on(name: str, tmp_path: Path) -> None:
     """gSDE draws before a rollout begins, which is when a checkpoint is written."""
     total = TOTAL.get(name, OTHERS)

@@ -32,6 +32,7 @@ from airl_mav.report.comparison.tables import (
 from airl_mav.report.flights_above import flight_pictures
 from airl_mav.report.theme import line_style
 from tests.report.test_report import Page
+from tests.support.page_alone import page_alone
 from tests.support.run_demo import demo_setup, write_demo_run
 
 EPISODES = 24
@@ -245,7 +246,8 @@ def test_it_is_the_same_when_it_is_made_again(
 
 def ask(*paths: Path, **options: Any) -> str:
     console = Console(record=True, width=100, file=io.StringIO())
-    assert report.run(report.ReportOptions(runs=paths, **options), console) == 0
+    with page_alone():
+        assert report.run(report.ReportOptions(runs=paths, **options), console) == 0
     return console.export_text()
 
 

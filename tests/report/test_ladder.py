@@ -42,6 +42,7 @@ from airl_mav.report.table import TableView
 from airl_mav.scenario.model import Scenario
 from tests.support.command_line import airl, option_words
 from tests.support.flown_here import flown_here
+from tests.support.page_alone import page_alone
 from tests.support.ports import choose_ports
 from tests.support.processes import write_arena
 from tests.support.run_demo import demo_arena, demo_episode, demo_setup
@@ -144,7 +145,8 @@ def test_levels_gym_and_lockstep_fly(tmp_path: Path) -> None:
     }
     levels = ("gym", "lockstep")
     with patch.object(ladder_experiment, "make_cell", make_cell), flown_here():
-        assert climb(out=tmp_path / "one", levels=levels, page=True, **options)[0] == 0
+        with page_alone():
+            assert climb(out=tmp_path / "one", levels=levels, page=True, **options)[0] == 0
         # The other way round it is flown again, and flies the same.
         assert climb(out=tmp_path / "two", levels=levels[::-1], **options)[0] == 0
     gym, lockstep = (lines(tmp_path / "one" / level) for level in levels)

@@ -21,6 +21,7 @@ from airl_mav.rehearsal.run_folder import FlownEpisode, load
 from airl_mav.report.comparison import show
 from tests.support.campaign_kit import same_runs
 from tests.support.command_line import airl, option_words
+from tests.support.page_alone import page_alone
 
 LATE = {"level": "gym", "computer": "ras-pi-4", "workload": "template-5x32"}
 TARGET, REFERENCE = "static-obstacles-target", "static-obstacles-reference"
@@ -69,7 +70,8 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     assert "goes on" in text
     assert not (out / "verdict.json").exists()
     assert len(outcomes(out / TARGET)) == 27
-    code, text = verdict(out, page=True, junit=out / "junit.xml", badge=out / "badge.svg")
+    with page_alone():
+        code, text = verdict(out, page=True, junit=out / "junit.xml", badge=out / "badge.svg")
     assert code == 3
     return out, text
 
