@@ -60,6 +60,7 @@ def draw_tours(
     boxes = with_room(keep_off, halves + gap_m)
     low, high = inner(bounds, 0.0)
     slowest, fastest = kind.speed_m_s
+    # Floats, whatever a profile has: the kernel would be compiled for whole numbers, too.
     points, counts, speeds = _walk_all(
         rng,
         halves,
@@ -70,11 +71,11 @@ def draw_tours(
         low,
         high,
         float(max(gap_m, kind.clearance_m)),
-        kind.clearance_m,
+        float(kind.clearance_m),
         float(kind.leg_max_m),
-        slowest,
-        fastest,
-        kind.dwell_s,
+        float(slowest),
+        float(fastest),
+        float(kind.dwell_s),
         float(kind.tour_min_s),
     )
     way = points.tolist()
