@@ -333,7 +333,7 @@ def test_contacts_agree_with_pybullet_s_distances() -> None:
             tuple(position),
             VEHICLE.radius,
             VEHICLE.half_height,
-            np.array([-50.0, 50.0, -50.0, 50.0, 5.0]),
+            np.array([-50.0, 50.0, -50.0, 50.0, 5.0, 0.0]),
             1,
             np.array([kind], np.int8),
             center[None],
@@ -370,7 +370,7 @@ def test_contacts_agree_with_pybullet_s_distances() -> None:
 
 def test_nothing_is_touched_within_the_clearance() -> None:
     rng = np.random.default_rng(6)
-    bounds = np.array([-9.0, 9.0, -9.0, 9.0, 5.0])
+    bounds = np.array([-9.0, 9.0, -9.0, 9.0, 5.0, 0.0])
     radius, half_height = VEHICLE.radius, VEHICLE.half_height
     spare = []
     for _ in range(300):

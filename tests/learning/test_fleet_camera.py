@@ -100,7 +100,7 @@ def test_depth_beyond_16_bits_is_clipped() -> None:
     spec = load_profile("arenas", "no-obstacles", ArenaSpec)
     world = generate(spec, 1, name="view", vehicle_width_m=0.55)
     fleet, arenas = new_fleet(1), batch_of([world])
-    arenas.bounds[0] = [-100.0, 100.0, -100.0, 100.0, 50.0]
+    arenas.bounds[0] = [-100.0, 100.0, -100.0, 100.0, 50.0, 0.0]
     fleet.position[0] = [0.0, 0.0, -20.0]
     out = np.zeros((1, 9, 9), np.uint16)
     render_images(fleet, arenas, np.ones(1, np.bool_), Mount((10.0, 0.0, 0.0), 0.0),

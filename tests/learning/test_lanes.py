@@ -132,7 +132,7 @@ def test_together_as_alone(n: int, windy: bool) -> None:
     for name in STATE:
         getattr(alone, name)[:] = getattr(fleet, name)
     far_off = arenas_of(n, "no-obstacles")
-    far_off.bounds[:] = [-1e6, 1e6, -1e6, 1e6, 1e6]
+    far_off.bounds[:] = [-1e6, 1e6, -1e6, 1e6, 1e6, 0.0]
     fleet.position[:, 2] = alone.position[:, 2] = -1e5
     weights = filters(VEHICLE.gains, TICK_S)
     never = Rules(goal_radius=0.0, time_limit_us=10**12)

@@ -221,9 +221,9 @@ def broken(folder: Path, what: str) -> Path:
     elif what == "deep":
         Image.fromarray(np.zeros((8, 8), np.uint16)).save(path)
     else:  # The header of a picture far larger than memory.
-        data = bytearray(_png(1))
-        data[16:24] = (2_000_000).to_bytes(4, "big") * 2
-        path.write_bytes(bytes(data))
+        header = bytearray(_png(1))
+        header[16:24] = (2_000_000).to_bytes(4, "big") * 2
+        path.write_bytes(bytes(header))
     return path
 
 

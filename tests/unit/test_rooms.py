@@ -17,6 +17,7 @@ from pydantic import ValidationError
 from rich.console import Console
 from scipy import ndimage, stats
 
+from airl_mav.arena.appearance import srgb_of
 from airl_mav.arena.describe import arena_table
 from airl_mav.arena.draw import OPENING_COLOUR, draw_arena
 from airl_mav.arena.footprints import bounding_boxes
@@ -24,11 +25,15 @@ from airl_mav.arena.generate import generate, local_bounds
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape
 from airl_mav.arena.indoors import seen_across
 from airl_mav.arena.rooms import Plan, draw_plan, over_doors
+from airl_mav.camera import primitives
+from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.picture import render_picture
 from airl_mav.core.errors import UsageError
 from airl_mav.envs.arenas import batch_of
 from airl_mav.envs.contact import CEILING, FLOOR, NOTHING, WALL, clearance, touches
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile, profile_digest
+from airl_mav.report.segmentation_colours import ROOM, coloured_segmentation
 from airl_mav.view.messages import ArenaShown
 
 WIDTH_M = 0.55
@@ -481,6 +486,25 @@ def test_the_table_tells_of_them(spec: ArenaSpec, arenas: list[Arena]) -> None:
     assert arena.building is not None
     assert f"{arena.building.rooms}, {arena.building.doors} doors" in told
     assert "4 m high" in told
+
+
+def test_a_camera_sees_the_ceiling_where_it_is(arenas: list[Arena]) -> None:
+    """Its height, its colour, and its grey in a picture of what is seen."""
+    camera = Intrinsics.from_fov(48, 32, 1.6)
+    arena, place = arenas[2], np.array([0.0, 0.0, -2.5])
+    seen = render_picture(arena, arena.centers_at(0), camera, place, np.array([1.0, 0, 0, 0]))
+    overhead = seen.seen == primitives.CEILING
+    assert overhead.sum() > 200
+    assert (seen.seen != primitives.SKY).all()
+    v = np.mgrid[:32, :48][0]
+    up = (camera.cy - v) / camera.focal * seen.depth_m
+    np.testing.assert_allclose(up[overhead], arena.bounds.height - 2.5, atol=1e-3)
+    glow = np.rint(255.0 * srgb_of(arena.look.light.zenith))
+    assert np.abs(seen.rgb[overhead].astype(float) - glow).max() <= 1.0
+    coloured = coloured_segmentation(seen.seen)
+    for number, colour in ROOM.items():
+        assert (coloured[seen.seen == number] == colour).all()
+    assert arena.look.light.sun.sum() == 0.0
 
 
 def test_the_ceilings_view_factor_is_that_of_rays() -> None:

@@ -532,11 +532,12 @@ def test_walls_are_seen_from_inside() -> None:
     pytest.importorskip("viser")
     from airl_mav.view.scene import walls
 
-    bounds = Bounds(-3.0, 30.0, -10.0, 10.0, 5.0)
-    corners, faces = walls(bounds)
     inside = np.array([10.0, 0.0, -2.0])
-    for a, b, c in corners[faces]:
-        assert np.cross(b - a, c - a) @ (inside - a) > 0.0
+    for ceiling, count in ((False, 8), (True, 10)):
+        corners, faces = walls(Bounds(-3.0, 30.0, -10.0, 10.0, 5.0, ceiling))
+        assert len(faces) == count
+        for a, b, c in corners[faces]:
+            assert np.cross(b - a, c - a) @ (inside - a) > 0.0
 
 
 # --- the command line
