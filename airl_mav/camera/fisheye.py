@@ -13,11 +13,13 @@ from airl_mav.camera.projection import Bent
 from airl_mav.core.errors import UsageError
 
 
-@lru_cache(maxsize=64)
 def bent_of(camera: Intrinsics) -> Bent | None:
     """Return the rays of a camera; None: it is no fisheye."""
-    if camera.projection != "fisheye":
-        return None
+    return _bent_of(camera) if camera.projection == "fisheye" else None
+
+
+@lru_cache(maxsize=64)
+def _bent_of(camera: Intrinsics) -> Bent:
     forward, right, down = np.ascontiguousarray(fisheye_rays(camera))
     return Bent(forward, down, right)
 

@@ -14,6 +14,7 @@ from rich.console import Console
 
 from airl_mav.arena.generate import generate
 from airl_mav.black_box.messages import SUFFIX
+from airl_mav.camera.flow import CameraMotion
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import Motion
 from airl_mav.cli.options import POSITIONAL, check_installed
@@ -35,6 +36,7 @@ from airl_mav.report.camera_pictures import (
     FILMS,
     VIDEO,
     Drawn,
+    Pixels,
     Shown,
     film,
     moments,
@@ -43,6 +45,14 @@ from airl_mav.report.camera_pictures import (
     write_png,
 )
 from airl_mav.report.camera_taken import TakingCamera, taken_film
+from airl_mav.report.ground_truth import (
+    ARRAY,
+    TRUTHS,
+    coloured_flow,
+    truth_film,
+    truth_of,
+    write_array,
+)
 from airl_mav.report.replay.runs import ReplayedRun
 from airl_mav.scenario.model import DEFAULT_ARENA, GREATEST_SEED
 
@@ -78,6 +88,7 @@ class RenderOptions(ProfileModel):
         airl render static-obstacles --seed 7
         airl render forest.toml --north-m 10 --height-m 3 --yaw-deg 30 --out forest.png
         airl render dense-obstacles --show segmentation --out seen.png
+        airl render dense-obstacles --show flow --speed-m-s 5 --out flow.npy
         airl render dense-obstacles --renderer mitsuba --samples 256
         airl render varied-looks --camera my-quad.toml --speed-m-s 5 --yaw-rate-deg-s 60
         airl render runs/A 7 --out flight.gif
@@ -96,7 +107,9 @@ class RenderOptions(ProfileModel):
         "seed of the arena; by default the profile's", "1", ge=0, le=GREATEST_SEED, default=None
     )
     show: Shown = Field(
-        default="rgb", description="colour, its luma, depth (near is bright), or what is seen"
+        default="rgb",
+        description="colour, its luma, depth (near is bright), segmentation (what is seen), or flow"
+        " (how fast it moves over the image)",
     )
     camera: str | None = Field(
         default=None,
@@ -105,10 +118,14 @@ class RenderOptions(ProfileModel):
         " and how the vehicle does",
     )
     speed_m_s: float = quantity(
-        "with --camera: how fast the vehicle flies ahead", "m/s", ge=-100, le=100, default=0.0
+        "with --camera or --show flow: how fast it flies ahead", "m/s", ge=-100, le=100, default=0.0
     )
     yaw_rate_deg_s: float = quantity(
-        "with --camera: how fast it turns, clockwise", "deg/s", ge=-1000, le=1000, default=0.0
+        "with --camera or --show flow: how fast it turns, clockwise",
+        "deg/s",
+        ge=-1000,
+        le=1000,
+        default=0.0,
     )
     renderer: Renderer = Field(
         default="raycast", description="what draws; mitsuba draws rgb alone, without fog"
@@ -122,8 +139,9 @@ class RenderOptions(ProfileModel):
     )
     out: Path | None = Field(
         default=None,
-        description="the file to write: .png of an arena; .gif, .mp4 or .webp of a flight; by"
-        " default render.png or render.gif",
+        description="the file to write: .png of an arena; .gif, .mp4 or .webp of a flight; .npy of"
+        " either, the numbers of depth [m], segmentation or flow [px/s]; by default render.png or"
+        " render.gif",
     )
     rate_hz: float = quantity(
         "pictures a second of a film, rounded to steps of 10 ms", "Hz", ge=1, le=50, default=10.0
@@ -201,15 +219,19 @@ def _check(options: RenderOptions, filmed: bool) -> None:
         if value != RenderOptions.model_fields[name].default:
             subject = "a flight" if filmed else "an arena"
             raise FieldError(name, value, problem=f"not for the picture of {subject}")
-    suffixes = FILMS if filmed else (".png",)
+    suffixes = (*(FILMS if filmed else (".png",)), ARRAY)
     if options.out is not None and options.out.suffix.lower() not in suffixes:
         names = " or ".join(", ".join(suffixes).rsplit(", ", 1))
         raise FieldError("out", f"{options.out}", f"a file name that ends in {names}")
-    for name in OF_A_VEHICLE if options.camera is None else OF_NO_VEHICLE:
+    numbers = options.out is not None and options.out.suffix.lower() == ARRAY
+    if numbers and (options.camera is not None or options.show not in TRUTHS):
+        accepted = f"{', '.join(TRUTHS[:-1])} or {TRUTHS[-1]} in a file {ARRAY}, without --camera"
+        raise FieldError("show", options.show, accepted)
+    for name in _not_asked_for(options):
         value = getattr(options, name)
         if value != RenderOptions.model_fields[name].default:
-            with_it = "without" if options.camera is None else "with"
-            raise FieldError(name, value, problem=f"{with_it} --camera")
+            problem = "with --camera" if options.camera else "without --camera or --show flow"
+            raise FieldError(name, value, problem=problem)
     check_fov("fov_deg", options.projection, options.fov_deg)
     if options.out is not None and options.out.suffix.lower() == VIDEO:
         check_installed("film")
@@ -217,6 +239,18 @@ def _check(options: RenderOptions, filmed: bool) -> None:
         check_installed("render")
         if options.show != "rgb":
             raise FieldError("show", options.show, "rgb with --renderer mitsuba")
+
+
+def _not_asked_for(options: RenderOptions) -> tuple[str, ...]:
+    """Return the options that the camera that is asked for has no use for."""
+    if options.camera is not None:
+        return OF_NO_VEHICLE
+    return () if options.show == "flow" else OF_A_VEHICLE
+
+
+def _is_truth(options: RenderOptions, out: Path) -> bool:
+    """Return whether what is asked for are numbers of the ground truth, or drawn of them."""
+    return options.show == "flow" or out.suffix.lower() == ARRAY
 
 
 def _camera(options: RenderOptions, size: tuple[int, int]) -> Intrinsics:
@@ -249,17 +283,26 @@ def _picture(options: RenderOptions, out: Path) -> str:
     position = np.array([options.north_m, options.east_m, -height])
     pitch, yaw = math.radians(options.pitch_up_deg), math.radians(options.yaw_deg)
     elapsed_us = round(options.time_s * US_PER_S)
+    attitude = quat_from_euler(0.0, pitch, yaw)
+    velocity = options.speed_m_s * np.array([math.cos(yaw), math.sin(yaw), 0.0])
+    rates = np.array([0.0, 0.0, math.radians(options.yaw_rate_deg_s)])
     if options.camera is not None:
-        velocity = options.speed_m_s * np.array([math.cos(yaw), math.sin(yaw), 0.0])
-        rates = np.array([0.0, 0.0, math.radians(options.yaw_rate_deg_s)])
-        motion = Motion(position, quat_from_euler(0.0, pitch, yaw), velocity, rates)
+        motion = Motion(position, attitude, velocity, rates)
         camera_of = TakingCamera(load_vehicle(options.camera).camera)
         write_png(out, camera_of(arena, elapsed_us, motion, arena.seed))
         return "picture"
     centers = arena.centers_at(elapsed_us)
     camera = _camera(options, STILL_PX)
+    if _is_truth(options, out):
+        moves = CameraMotion(position, attitude, velocity, rates)
+        truth = truth_of(options.show, arena, elapsed_us, camera, moves)
+        if out.suffix.lower() == ARRAY:
+            write_array(out, truth)
+            return options.show
+        write_png(out, coloured_flow(truth))
+        return "picture"
     drawn = _drawn(options, options.samples or SAMPLES[options.renderer])
-    write_png(out, drawn(arena, centers, camera, position, quat_from_euler(0.0, pitch, yaw)))
+    write_png(out, drawn(arena, centers, camera, position, attitude))
     return "picture"
 
 
@@ -283,7 +326,15 @@ def _film(options: RenderOptions, path: Path, out: Path, console: Console) -> st
                 yield time_us
                 bar.advance()
 
-        if taking is None:
+        pictures: Iterator[Pixels]
+        if _is_truth(options, out):
+            truths = truth_film(options.show, flight, camera, told())
+            if out.suffix.lower() == ARRAY:
+                stack = np.stack(list(truths))
+                write_array(out, stack)
+                return f"{options.show} of flight {record.index}, {len(stack)} pictures"
+            pictures = map(coloured_flow, truths)
+        elif taking is None:
             pictures = film(flight, camera, drawn, told())
         else:
             pictures = taken_film(flight, taking, told())

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from airl_mav.camera.frame import MM_PER_M
 from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import ned_to_heading, quats_to_euler
 from airl_mav.policy.observation import Observation
 
@@ -79,7 +80,9 @@ class Scanning(NamedTuple):
 
 @cache
 def rays_of(camera: Intrinsics) -> Rays:
-    """Return where the pixels of a camera look."""
+    """Return where the pixels of a camera look: of a pinhole or a cylinder. Raises UsageError."""
+    if camera.projection == "fisheye":
+        raise UsageError("a fisheye gives no level scan; accepted: a pinhole or a cylinder")
     columns: Floats = (np.arange(camera.width, dtype=np.float64) - camera.cx) / camera.focal
     down: Floats = (np.arange(camera.height, dtype=np.float64) - camera.cy) / camera.focal
     if camera.cylindrical:

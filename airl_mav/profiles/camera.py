@@ -105,8 +105,6 @@ class Camera(ProfileModel):
                 "camera.stereo", self.projection, "left out where the projection is not pinhole"
             )
         check_matched("camera.kind", self)
-        if self.imaging is not None:
-            _check_imaging(self.imaging, self)
         return self
 
     @model_serializer(mode="wrap")
@@ -132,13 +130,15 @@ class Camera(ProfileModel):
 
 
 def check_matched(field: str, camera: Camera) -> None:
-    """Raise FieldError, naming the field, for stereo matching or imaging of another kind."""
+    """Raise FieldError, naming the field, for tables of another kind of camera."""
     if camera.imaging is not None and camera.kind == "depth":
         raise FieldError(
             field,
             camera.kind,
             problem="with a table camera.imaging; accepted: rgb or grey with one",
         )
+    if camera.imaging is not None:
+        _check_imaging(camera.imaging, camera)
     if camera.ranging is not None and (camera.kind != "depth" or camera.stereo is not None):
         problem = (
             "with a table camera.ranging; accepted: 'depth' with one, and without camera.stereo"

@@ -26,7 +26,7 @@ from airl_mav.report.forensics.camera_view import PolicyCamera, pose_at
 from airl_mav.report.replay.flight import ReplayedFlight
 from airl_mav.report.segmentation_colours import coloured_segmentation
 
-Shown = Literal["rgb", "grey", "depth", "segmentation"]
+Shown = Literal["rgb", "grey", "depth", "segmentation", "flow"]
 Pixels = NDArray[np.uint8]
 """(h, w) or (h, w, 3)."""
 
@@ -67,7 +67,7 @@ def still(
         camera: Its intrinsics.
         position: (3,) camera NED [m].
         quaternion: (4,) unit [w, x, y, z] camera -> NED.
-        show: What to draw.
+        show: What to draw; of flow, which needs the motion, `report.ground_truth` makes pictures.
         rays: Of a pixel of rgb and grey, each way.
         range_m: Depth that is darkest [m].
     """

@@ -76,10 +76,15 @@ def taken_film(
     if flight.arena is None:
         raise UsageError(f"flight {flight.label}: its arena cannot be made any more")
     for time_us in moments:
-        position, velocity, quaternion = pose_at(flight.path, time_us)
-        motion = Motion(position, quaternion, velocity, _rates(flight, time_us))
+        motion = recorded_motion(flight, time_us)
         elapsed_us = time_us - flight.record.started_us
         yield camera(flight.arena, elapsed_us, motion, flight.record.seed)
+
+
+def recorded_motion(flight: ReplayedFlight, time_us: int) -> Motion:
+    """Return how the vehicle of a recorded flight moved at a time [µs]."""
+    position, velocity, quaternion = pose_at(flight.path, time_us)
+    return Motion(position, quaternion, velocity, _rates(flight, time_us))
 
 
 def _rates(flight: ReplayedFlight, time_us: int) -> NDArray[np.float64]:

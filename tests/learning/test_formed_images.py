@@ -87,6 +87,11 @@ def test_what_was_trained_before_sees_no_difference(tmp_path: Path) -> None:
     np.testing.assert_array_equal(captured(formed), captured(plain))
 
 
+def test_a_mosaic_is_refused_where_training_makes_the_camera_grey(tmp_path: Path) -> None:
+    with pytest.raises(FieldError, match=r"camera\.imaging\.bayer.*kind 'grey'"):
+        flown(tmp_path, "bayer = true", camera={"kind": "grey"})
+
+
 def test_a_gain_that_takes_time_is_refused_in_the_twin(tmp_path: Path) -> None:
     told = r"time_constant_s.*0.3.*0 in the batch twin"
     with pytest.raises(FieldError, match=told):

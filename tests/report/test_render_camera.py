@@ -11,7 +11,10 @@ from PIL import Image, ImageSequence
 from rich.console import Console
 
 from airl_mav.arena.generate import generate
+from airl_mav.camera.flow import CameraMotion, optical_flow, velocities_of
 from airl_mav.camera.imaging import ImageFormation
+from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.picture import render_picture
 from airl_mav.camera.render import Motion
 from airl_mav.cli.options import carry_out
 from airl_mav.core.errors import UsageError
@@ -92,9 +95,50 @@ def test_a_film_has_the_pictures_of_that_camera(vehicle: Path, tmp_path: Path) -
     [
         (("--camera", "quad-rgb", "--show", "depth"), "--show depth: with --camera"),
         (("--camera", "quad-rgb", "--width-px", "64"), "--width-px 64: with --camera"),
-        (("--speed-m-s", "3"), "--speed-m-s 3(.0)?: without --camera"),
+        (("--speed-m-s", "3"), "--speed-m-s 3(.0)?: without --camera or --show flow"),
     ],
 )
 def test_what_the_profile_says_is_not_asked_for(words: tuple[str, ...], told: str) -> None:
     with pytest.raises(UsageError, match=told):
         render("no-obstacles", *words)
+
+
+def test_ground_truth_is_written_as_numbers(tmp_path: Path) -> None:
+    """Of an arena: the caster's own, and flow of a camera that flies ahead."""
+    spec = load_profile("arenas", "dynamic-obstacles", ArenaSpec)
+    arena = generate(spec, 4, name="dynamic-obstacles", vehicle_width_m=0.55)
+    k = Intrinsics.from_fov(64, 48, math.radians(90.0))
+    at, north = np.array([0.0, 0.0, -2.0]), np.array([1.0, 0.0, 0.0, 0.0])
+    picture = render_picture(arena, arena.centers_at(1_500_000), k, at, north)
+    size = ("--width-px", "64", "--height-px", "48", "--height-m", "2", "--time-s", "1.5")
+    found = {}
+    for show in ("depth", "segmentation", "flow"):
+        out, moves = tmp_path / f"{show}.npy", ("--speed-m-s", "4") if show == "flow" else ()
+        words = ("--seed", "4", "--show", show, *size, *moves, "--out", str(out))
+        render("dynamic-obstacles", *words)
+        found[show] = np.load(out)
+    np.testing.assert_array_equal(found["depth"], picture.depth_m)
+    np.testing.assert_array_equal(found["segmentation"], picture.seen)
+    motion = CameraMotion(at, north, np.array([4.0, 0.0, 0.0]), np.zeros(3))
+    flow = optical_flow(picture, k, motion, velocities_of(arena, 1_500_000))
+    np.testing.assert_array_equal(found["flow"], flow)
+    # As a picture, too: what does not move is white.
+    render("no-obstacles", *size, "--show", "flow", "--out", str(tmp_path / "flow.png"))
+    with Image.open(tmp_path / "flow.png") as image:
+        assert (np.asarray(image) == 255).all()
+
+
+def test_ground_truth_of_a_flight_is_one_array(tmp_path: Path) -> None:
+    folder, _ = write_demo_run(tmp_path / "run", episodes=1, profile="dynamic-obstacles")
+    size = ("--width-px", "32", "--height-px", "24", "--rate-hz", "2")
+    out = tmp_path / "flow.npy"
+    render(str(folder.path), "0", *size, "--show", "flow", "--out", str(out))
+    flows = np.load(out)
+    assert flows.shape[1:] == (24, 32, 2)
+    assert flows.dtype == np.float32
+    assert len(flows) > 2
+    assert np.isfinite(flows).all()
+    assert np.abs(flows).max() > 1.0
+    render(str(folder.path), "0", *size, "--show", "flow", "--out", str(tmp_path / "flow.webp"))
+    with pytest.raises(UsageError, match=r"accepted: depth, segmentation or flow in a file \.npy"):
+        render(str(folder.path), "--out", str(tmp_path / "x.npy"))

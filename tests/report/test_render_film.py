@@ -132,7 +132,7 @@ def test_a_video_of_odd_size_is_refused(folder: Path, tmp_path: Path) -> None:
         (("--seed", "3"), "--seed 3: not for the picture of a flight"),
         (("--north-m", "3"), "--north-m 3: not for the picture of a flight"),
         (("7",), "0 to 1, as far as recorded"),
-        (("--out", "x.png"), "accepted: a file name that ends in .gif, .mp4 or .webp"),
+        (("--out", "x.png"), "accepted: a file name that ends in .gif, .mp4, .webp or .npy"),
     ],
 )
 def test_what_does_not_go_with_a_flight_is_one_line(

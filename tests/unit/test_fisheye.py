@@ -23,6 +23,7 @@ from airl_mav.core.frames import quat_from_euler, quat_to_matrix
 from airl_mav.policy.greedy import near_points
 from airl_mav.policy.observation import Kinematics, observe
 from airl_mav.policy.observation_spec import ObservationSpec, camera_mismatch
+from airl_mav.policy.scans import rays_of
 from airl_mav.prediction.reprojection import CameraPose, Reprojector, Sight
 from airl_mav.profiles.appearance import DEFAULT
 from airl_mav.profiles.mesh_file import MeshFile
@@ -172,6 +173,8 @@ def test_what_it_does_not_see_is_refused() -> None:
                 "horizontal_fov_deg": 191.0,
             }
         )
+    with pytest.raises(UsageError, match="a fisheye gives no level scan"):
+        rays_of(WIDE)
     with pytest.raises(ValueError, match=r"fisheye.*accepted: pinhole or cylindrical with"):
         ObservationSpec(
             layout="scan",

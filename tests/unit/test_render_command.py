@@ -122,6 +122,6 @@ def test_mitsuba_has_neither_depth_nor_fog(tmp_path: Path) -> None:
 
 
 def test_only_png_files_are_written(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match=r"accepted: a file name that ends in \.png"):
+    with pytest.raises(UsageError, match=r"accepted: a file name that ends in \.png or \.npy"):
         carry_out("airl render", "airl_mav.cli.render", ["--out", str(tmp_path / "x.jpg")])
     assert not list(tmp_path.iterdir())

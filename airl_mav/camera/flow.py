@@ -1,0 +1,128 @@
+"""Optical flow: how fast what a pixel shows moves over the image, in closed form.
+
+A point p in the camera's axes moves by p' = R^T (v_point - v_camera) - w x p, where R are these
+axes, and w is their angular velocity; its place in the image moves by the derivative of the
+projection along p' (Longuet-Higgins and Prazdny, "The interpretation of a moving retinal image",
+1980). What is infinitely far moves by the rotation alone.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.arena.geometry import Arena
+from airl_mav.camera.equidistant import fisheye_rays
+from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.picture import Picture
+from airl_mav.camera.primitives import OBSTACLE
+from airl_mav.camera.render import Motion, Mount, camera_pose
+from airl_mav.core.constants import US_PER_S
+from airl_mav.core.frames import quat_to_matrix
+
+Floats = NDArray[np.float64]
+
+MOVED_OVER_US = 1_000
+"""Velocities of moving obstacles are those between so long before and after a moment [µs]."""
+
+_ON_AXIS = 1e-9
+
+
+class CameraMotion(NamedTuple):
+    """How a camera moves at a moment."""
+
+    position: Floats
+    """(3,) NED [m]."""
+    quaternion: Floats
+    """(4,) camera -> NED; its x axis is the optical axis."""
+    velocity: Floats
+    """(3,) NED [m/s]."""
+    rates: Floats
+    """(3,) angular velocity about the camera's axes forward, right, down [rad/s]."""
+
+
+def motion_of_camera(vehicle: Motion, mount: Mount) -> CameraMotion:
+    """Return how a camera moves that sits on a vehicle."""
+    at, attitude = camera_pose(vehicle.position, vehicle.quaternion, mount)
+    body = quat_to_matrix(vehicle.quaternion)
+    lever = np.cross(vehicle.rates, np.array(mount.offset))
+    axes = quat_to_matrix(np.array(attitude))
+    rates = axes.T @ body @ vehicle.rates
+    return CameraMotion(np.array(at), np.array(attitude), vehicle.velocity + body @ lever, rates)
+
+
+def velocities_of(arena: Arena, elapsed_us: int) -> Floats:
+    """Return the velocities (n, 3) NED [m/s] of all obstacles, `elapsed_us` after the start."""
+    before, after = (
+        arena.centers_at(elapsed_us + step) for step in (-MOVED_OVER_US, MOVED_OVER_US)
+    )
+    found: Floats = (after - before) * (US_PER_S / (2.0 * MOVED_OVER_US))
+    return found
+
+
+def optical_flow(
+    picture: Picture, camera: Intrinsics, motion: CameraMotion, velocities: Floats
+) -> NDArray[np.float32]:
+    """Return how fast what each pixel shows moves over the image.
+
+    Args:
+        picture: What the camera sees.
+        camera: Its intrinsics.
+        motion: How it moves.
+        velocities: (n, 3) of the obstacles NED [m/s].
+
+    Returns:
+        (h, w, 2) columns and rows a second [px/s]; NaN in a fisheye's pixels that see nothing.
+    """
+    rays = rays_of(camera)
+    axes = quat_to_matrix(motion.quaternion)
+    depth = picture.depth_m.astype(np.float64)
+    far = depth <= 0.0
+    points = rays * np.where(far, 1.0, depth)
+    number = picture.seen - OBSTACLE
+    moves = np.zeros((*depth.shape, 3))
+    if len(velocities):
+        moves = np.where((number >= 0)[..., None], velocities[np.maximum(number, 0)], 0.0)
+    apart = (moves - motion.velocity) @ axes
+    apart[far] = 0.0
+    turning = np.cross(motion.rates, np.moveaxis(points, 0, -1))
+    flow = np.stack(_pushed(camera, points, np.moveaxis(apart - turning, -1, 0)), axis=-1)
+    flow[~rays.any(axis=0)] = np.nan
+    return flow.astype(np.float32)
+
+
+def rays_of(camera: Intrinsics) -> Floats:
+    """Return the rays (3, h, w) of a camera's pixels at a depth of 1: forward, right, down."""
+    if camera.projection == "fisheye":
+        return fisheye_rays(camera)
+    rays = np.ones((3, camera.height, camera.width))
+    across = (np.arange(camera.width) - camera.cx) / camera.focal
+    if camera.cylindrical:
+        rays[0], rays[1] = np.cos(across), np.sin(across)
+    else:
+        rays[1] = across
+    rays[2] = ((np.arange(camera.height) - camera.cy) / camera.focal)[:, None]
+    return rays
+
+
+def _pushed(camera: Intrinsics, points: Floats, moves: Floats) -> tuple[Any, Any]:
+    """Return how fast points (3, h, w), which move so (3, h, w), move over the image [px/s]."""
+    (z, x, y), (dz, dx, dy), f = points, moves, camera.focal
+    with np.errstate(invalid="ignore", divide="ignore"):
+        if camera.projection == "pinhole":
+            return f * (dx - x / z * dz) / z, f * (dy - y / z * dz) / z
+        if camera.cylindrical:
+            square = x * x + z * z
+            away = np.sqrt(square)
+            receding = (x * dx + z * dz) / square
+            return f * (z * dx - x * dz) / square, f * (dy - y * receding) / away
+        aside = np.hypot(x, y)
+        off = np.arctan2(aside, z)
+        growing = (x * dx + y * dy) / aside
+        # Columns and rows are f c x and f c y, with c = off / aside, which is 1 / z on the axis.
+        share = np.where(aside > _ON_AXIS, off / aside, 1.0 / z)
+        opening = (z * growing - aside * dz) / (aside * aside + z * z)
+        changing = np.where(aside > _ON_AXIS, (opening - share * growing) / aside, -dz / (z * z))
+        return f * (changing * x + share * dx), f * (changing * y + share * dy)
