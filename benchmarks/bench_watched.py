@@ -8,8 +8,8 @@ lockstep  The same flight at full speed, alone, with a view that nobody looks at
           fingerprints, and wall time.
 sitl      Flights in real time on twenty seeds, each alone and with a page, in turn: t2, how late
           the vehicle's ticks were, and the simulated time that was given up, paired by seed. The
-          page draws at the lowest priority, as a browser of another machine would take nothing;
-          with `--same-machine` it takes what it wants.
+          watcher is elsewhere: a process takes all that a page gets, and draws nothing. With
+          `--browser` it is a browser of this machine, at the lowest priority.
 training  The same short training, alone and watched: weights, wall time and processor time.
 """
 
@@ -26,10 +26,11 @@ import tempfile
 import time
 import zipfile
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 
@@ -48,7 +49,29 @@ from tests.support.browser import Page, browser  # noqa: E402
 from tests.support.processes import SITL_WITHOUT_REPORT  # noqa: E402
 
 LOWEST = 19
-"""Niceness of a browser that takes no more than what is left over."""
+"""Niceness of what takes no more than what is left over."""
+
+ELSEWHERE = """
+import sys
+import msgspec, viser
+from websockets.sync.client import connect
+url = sys.argv[1].replace("http", "ws")
+camera = dict(
+    type="ViewerCameraMessage", wxyz=[1.0, 0.0, 0.0, 0.0], position=[-8.0, 0.0, -4.0], fov=1.0,
+    near=0.1, far=1000.0, image_height=600, image_width=900, look_at=[0.0, 0.0, 0.0],
+    up_direction=[0.0, 0.0, -1.0],
+)
+with connect(url, subprotocols=["viser-v" + viser.__version__], max_size=None) as page:
+    page.send(msgspec.msgpack.encode(camera))
+    print(flush=True)
+    taken = 0
+    try:
+        while True:
+            taken += len(page.recv())
+    except Exception:
+        print(taken)
+"""
+"""A watcher that draws nothing; it prints a line when it watches, and how many bytes it got."""
 
 
 def say(*words: object) -> None:
@@ -111,6 +134,36 @@ def measure_lockstep(folder: Path, pairs: int = 4) -> None:
     say(f"fingerprints of all {4 * pairs} flights: {'the same' if len(digests) == 1 else digests}")
 
 
+Watch: TypeAlias = Callable[[Path, str], AbstractContextManager[None]]
+"""Watches the page of an address for a while, with a folder of its own."""
+
+
+@contextmanager
+def by_browser(folder: Path, url: str) -> Iterator[None]:
+    with browser(folder, niceness=LOWEST) as page:
+        page.resize(900, 600)
+        page.open(url)
+        yield
+
+
+@contextmanager
+def elsewhere(folder: Path, url: str) -> Iterator[None]:
+    words = ["nice", "-n", str(LOWEST), sys.executable, "-c", ELSEWHERE, url]
+    log = folder / "watcher.log"
+    with log.open("w") as told:
+        process = subprocess.Popen(words, stdout=told, stderr=told)  # noqa: S603 (this file)
+    end = time.monotonic() + 60.0
+    while not log.read_text():
+        assert time.monotonic() < end, "nobody watches"
+        time.sleep(0.02)
+    try:
+        yield
+    finally:
+        process.wait(10.0)
+        taken = int(log.read_text().split()[-1])
+        assert taken > 100_000, f"a watcher that got {taken} bytes"
+
+
 @dataclass(frozen=True)
 class Disturbed:
     """How well a host has kept up with a flight in real time [ms]."""
@@ -123,12 +176,12 @@ class Disturbed:
     """Simulated time that was given up."""
 
 
-def measure_sitl(folder: Path, pairs: int = 20, niceness: int = LOWEST) -> None:
+def measure_sitl(folder: Path, pairs: int = 20, watch: Watch = elsewhere) -> None:
     rows: dict[bool, list[Disturbed]] = {False: [], True: []}
     for seed in range(11, 11 + pairs):
         for watched in (False, True):
             out = folder / f"{seed}-{watched}"
-            rows[watched].append(disturbed(out, seed, niceness if watched else None))
+            rows[watched].append(disturbed(out, seed, watch if watched else None))
         alone, seen = rows[False][-1], rows[True][-1]
         say(f"seed {seed}: alone {alone}, watched {seen}")
     for watched, found in rows.items():
@@ -149,8 +202,8 @@ def told(more: Estimate) -> str:
     return f"{more.value:+.1f} [{more.low:+.1f}, {more.high:+.1f}] %, n = {more.n}"
 
 
-def disturbed(out: Path, seed: int, niceness: int | None) -> Disturbed:
-    """Fly a seed at level sitl, watched by a browser of some niceness or by none."""
+def disturbed(out: Path, seed: int, watch: Watch | None) -> Disturbed:
+    """Fly a seed at level sitl, watched or not, and return how well the host has kept up."""
     from airl_mav.rehearsal.run_folder import TICK_LATENESS
     from airl_mav.rehearsal.run_folder import load as load_run
 
@@ -158,20 +211,18 @@ def disturbed(out: Path, seed: int, niceness: int | None) -> Disturbed:
     words += ["--out", str(out), "--policy", "static-obstacles"]
     with ExitStack() as held:
         process = subprocess.Popen(  # noqa: S603 (this checkout)
-            words + ([] if niceness is None else ["--view"]),
+            words + ([] if watch is None else ["--view"]),
             cwd=ROOT,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
         )
         assert process.stdout is not None
-        if niceness is not None:
+        if watch is not None:
             line = next(each for each in process.stdout if "view" in each)
-            profile = out.with_suffix(".browser")
+            profile = out.with_suffix(".watcher")
             profile.mkdir()
-            page = held.enter_context(browser(profile, niceness=niceness))
-            page.resize(900, 600)
-            page.open(line.split()[-1])
+            held.enter_context(watch(profile, line.split()[-1]))
         rest = process.stdout.read()
         assert process.wait() == 0, rest
     run = load_run(out)
@@ -248,7 +299,7 @@ def main() -> None:
     )
     parser.add_argument("what", nargs="*", choices=[*MEASURES, []], help="by default all")
     parser.add_argument(
-        "--same-machine", action="store_true", help="level sitl: the browser takes what it wants"
+        "--browser", action="store_true", help="level sitl: a browser of this machine watches"
     )
     parser.add_argument("--train", nargs="+", help=argparse.SUPPRESS)
     asked = parser.parse_args()
@@ -256,8 +307,8 @@ def main() -> None:
         train(*asked.train, *[None] * (3 - len(asked.train)))
         return
     say(load())
-    if asked.same_machine:
-        MEASURES["sitl"] = partial(measure_sitl, niceness=0)
+    if asked.browser:
+        MEASURES["sitl"] = partial(measure_sitl, watch=by_browser)
     for name in asked.what or MEASURES:
         say(f"--- {name}")
         with tempfile.TemporaryDirectory() as folder:

@@ -149,12 +149,14 @@ class Pilot:
         """Run one decision; return why the flight has ended meanwhile, in words."""
         clock, settings = self.clock, self.settings
         self.watchdog.doing("inference")
+        # Before its time begins: to draw how long it shall take is no part of a computation.
+        lasts_us = None if self.latency is None else self.latency.sample_us()
         started_us = clock.time_us()
         observation = self._observe(seen, state, goal, started_us)
         action = limited(self.policy.act(observation), settings.max_speed_m_s)
-        if self.latency is not None:
+        if lasts_us is not None:
             # Not to be interrupted: a computation is not.
-            clock.sleep_until(started_us + self.latency.sample_us())
+            clock.sleep_until(started_us + lasts_us)
         ready_us = clock.time_us()
         down = action.down_m_s
         if down is None:
@@ -178,8 +180,8 @@ class Pilot:
         if self.decided is not None:
             held_us = sent_us + (hold_us if settings.decisions == "sequential" else 0)
             times = started_us, ready_us, sent_us, held_us, self.held_us
-            lasts_us = None if expires_us is None else int(expires_us)
-            self.decided(Decided(seen, state, setpoint, *times, lasts_us, observation.image))
+            until_us = None if expires_us is None else int(expires_us)
+            self.decided(Decided(seen, state, setpoint, *times, until_us, observation.image))
         t2_us = np.array([ready_us - started_us])
         if self.compensator is None:
             self.memory.decided(ONE, np.array([setpoint]), t2_us)

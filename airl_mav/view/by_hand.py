@@ -24,19 +24,24 @@ class Hand:
         self.touched = False
         """Whether a decision of this flight was made otherwise than the scenario says."""
         self._newest = newest
+        self._known = Steering()
         self._as_asked = compensate
 
     def t2_us(self) -> int | None:
-        """Return the latency that was set [µs]; None: as the scenario says."""
-        t2_ms = self._newest().t2_ms
+        """Return the latency that is set for the coming decision [µs]; None: the scenario's.
+
+        What the watchers want is asked here, once a decision and before its time begins.
+        """
+        self._known = self._newest()
+        t2_ms = self._known.t2_ms
         if t2_ms is None:
             return None
         self.touched = True
         return round(t2_ms * US_PER_MS)
 
     def compensates(self) -> bool:
-        """Return whether decisions are compensated now."""
-        wanted = self._newest().compensate
+        """Return whether this decision is compensated."""
+        wanted = self._known.compensate
         if wanted is None or wanted == self._as_asked:
             return self._as_asked
         self.touched = True

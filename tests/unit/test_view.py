@@ -8,7 +8,6 @@ from collections import deque
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -324,9 +323,12 @@ def test_compensation_is_switched_in_flight() -> None:
     compensator.begin(0)
     one = np.zeros(1, np.intp)
     compensator.decided(one, np.array([[3.0, 0.0, 0.0, 0.0]]), np.array([400_000]), np.array([0]))
-    look = partial(
-        compensator.foresee, one, depth_mm, np.array([20_000]), np.array([1_000_000]), state
-    )
+
+    def look() -> tuple[Any, Any]:
+        hand.t2_us()  # as every decision begins
+        age, now = np.array([20_000]), np.array([1_000_000])
+        return compensator.foresee(one, depth_mm, age, now, state)
+
     _, foreseen = look()
     assert foreseen.position[0, 0] > 0.5
     assert hand.touched
