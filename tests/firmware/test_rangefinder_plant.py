@@ -64,7 +64,7 @@ def test_rays_are_pybullet_s(name: str) -> None:
             attitude = Rotation.from_euler("ZYX", rng.uniform([-3, -0.7, -0.7], [3, 0.7, 0.7]))
             start = position + attitude.apply([0.3, -0.2, 0.1])
             down = attitude.apply([0.0, 0.0, 1.0])
-            ((_, _, share, _, _),) = pybullet.rayTest(
+            ((_, _, share, _, normal),) = pybullet.rayTest(
                 ned_to_enu(start).tolist(),
                 ned_to_enu(start + 30.0 * down).tolist(),
                 physicsClientId=world.number,
@@ -75,7 +75,9 @@ def test_rays_are_pybullet_s(name: str) -> None:
             true = 30.0 * share
             if true >= 29.0:
                 continue
-            assert found == pytest.approx(true, abs=2e-3)
+            # pybullet's rounded bodies have a margin: it counts across the surface.
+            upright = abs(float(np.dot(ned_to_enu(down), normal)))
+            assert found == pytest.approx(true, abs=1e-3 / max(upright, 0.05))
             hit_obstacles += true < -start[2] / down[2] - 0.05
     finally:
         world.close()

@@ -580,7 +580,7 @@ def test_a_policy_is_copied_to_fly_otherwise(
         (
             "dqn.zip",
             ["--algorithm", "DQN", "--image", "2x2"],
-            ["--image 2x2: height_px 2", "4 <= value"],
+            ["--image 2x2: width_px 2", "4 <= value"],
         ),
         (
             "dqn.zip",

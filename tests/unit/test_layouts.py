@@ -368,8 +368,10 @@ def test_only_a_cylinder_sees_all_round() -> None:
     assert spec().projection == "pinhole"
     with pytest.raises(FieldError, match=r"horizontal_fov_deg 360.*< 170 deg with .*pinhole"):
         spec(horizontal_fov_deg=360.0)
+    with pytest.raises(FieldError, match=r"horizontal_fov_deg 360.*190 deg with .*fisheye"):
+        spec(projection="fisheye", horizontal_fov_deg=360.0)
     with pytest.raises(ValidationError, match="pinhole"):
-        spec(projection="fisheye")
+        spec(projection="orthographic")
 
 
 @pytest.mark.parametrize(
