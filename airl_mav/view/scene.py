@@ -116,8 +116,13 @@ class FlightScene:
                 self._build(episode, shown.arena)
             if shown.vehicle is not None:
                 self._move(shown, shown.vehicle, episode)
-        if picture and shown.picture is not None and self._look.whole:
-            range_m = episode.vehicle.camera_range_m
+        if picture:
+            self.draw_picture(shown)
+
+    def draw_picture(self, shown: Shown) -> None:
+        """Draw what the camera sees, in the scene that has been drawn."""
+        if shown.picture is not None and shown.episode is not None and self._look.whole:
+            range_m = shown.episode.vehicle.camera_range_m
             self._camera.image = camera_picture(shown.picture, range_m)
 
     # --- once an episode

@@ -23,8 +23,8 @@ DRAW_US = 33_000
 LATE_US = 500_000
 """A page that was busy for longer goes on from where it was [wall µs]."""
 
-PANEL_EVERY = 4
-"""Drawings of the scene for one of the panel, while it plays."""
+PANEL_S = 0.2
+"""Time between two drawings of the panel and the camera's image [wall s]."""
 
 STEP_S = 0.02
 """Step of the slider: that of the recording [s]."""
@@ -65,6 +65,11 @@ class ReplayPage:
         self._watchers = Watchers(server)
         self._playing = True
         self._dirty = True
+        self._behind = False
+        """Whether the panel shows an earlier moment than the scene."""
+        self._since_panel_s = PANEL_S
+        self._slid = False
+        """Whether the slider is where it is because somebody drags it."""
         self._drawn = 0
         self._choose(first or run.records[0])
 
@@ -86,7 +91,7 @@ class ReplayPage:
         def _(event: Any) -> None:
             if event.client is not None:
                 self._playing = False
-                self._go_to(self._time.value)
+                self._go_to(self._time.value, slid=True)
 
         @self._buttons.on_click
         def _(_event: object) -> None:
@@ -131,9 +136,9 @@ class ReplayPage:
             return self._flight.duration_s
         return (int(later[0]) - self._flight.record.started_us) / US_PER_S
 
-    def _go_to(self, seconds: float) -> None:
+    def _go_to(self, seconds: float, *, slid: bool = False) -> None:
         self._seconds = min(max(0.0, seconds), self._flight.duration_s)
-        self._dirty = True
+        self._dirty, self._slid = True, slid
 
     # --- drawing
 
@@ -154,23 +159,35 @@ class ReplayPage:
         if self._playing:
             self._go_to(self._seconds + wall_s * SPEEDS[self._speed.value])
             self._playing = self._seconds < self._flight.duration_s
+        self._since_panel_s += wall_s
+        due = self._since_panel_s >= PANEL_S
         if self._dirty:
-            self.draw(panel=not self._playing or self._drawn % PANEL_EVERY == 0)
+            self.draw(panel=due)
+        elif self._behind and due:
+            self._draw_panel()
         self._watchers.follow(self._shown)
 
     def draw(self, *, panel: bool = True) -> None:
         """Draw the present moment; the panel only where `panel` says so."""
         self._dirty = False
+        self._behind = True
         self._drawn += 1
         self._flight.show(self._shown, self._seconds)
-        self._scene.draw(self._shown, picture=panel)
+        self._scene.draw(self._shown, picture=False)
         if self._other is not None:
             self._other.show(self._others, self._seconds)
         self._ghost.draw(self._others, picture=False)
         if panel:
+            self._draw_panel()
+
+    def _draw_panel(self) -> None:
+        """Draw the panel and the camera's image, which take a page longer than the scene."""
+        self._behind, self._since_panel_s = False, 0.0
+        self._scene.draw_picture(self._shown)
+        if not self._slid:  # Else it would be pulled back from under the hand that drags it.
             self._time.value = round(self._seconds, 2)
-            self._panel.draw(self._shown)
-            self._panel.draw_strip(self._shown)
+        self._panel.draw(self._shown)
+        self._panel.draw_strip(self._shown)
 
 
 def _label(record: EpisodeRecord) -> str:
