@@ -224,13 +224,14 @@ class Circle:
 
 
 @contextmanager
-def viewed() -> Iterator[Viewer]:
+def viewed(*, paced: bool = False) -> Iterator[Viewer]:
+    """Open a view; `paced`: of a flight whose pace and latency its watchers set."""
     request = Request(
         run="bench",
         port=None,
-        paced=False,
+        paced=paced,
         speed=None,
-        steerable=False,
+        steerable=paced,
         compensable=False,
         compensated=False,
     )

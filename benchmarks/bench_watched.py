@@ -18,7 +18,6 @@ from __future__ import annotations
 import argparse
 import gc
 import hashlib
-import os
 import statistics
 import subprocess
 import sys
@@ -26,7 +25,7 @@ import tempfile
 import time
 import zipfile
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -37,14 +36,14 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from airl_mav.flight.paired import median_ratio  # noqa: E402 (from here on the checkout is found)
+from bench_view import load, say, viewed, wait_for  # noqa: E402 (from here on it is found)
+
+from airl_mav.flight.paired import median_ratio  # noqa: E402
 from airl_mav.flight.statistics import Estimate  # noqa: E402
 from airl_mav.profiles.loading import load_profile  # noqa: E402
 from airl_mav.scenario.model import Scenario  # noqa: E402
 from airl_mav.scenario.resolve import resolve  # noqa: E402
 from airl_mav.view.ends import ViewEnds  # noqa: E402
-from airl_mav.view.handshake import Request  # noqa: E402
-from airl_mav.view.viewer import Viewer  # noqa: E402
 from tests.support.browser import Page, browser  # noqa: E402
 from tests.support.processes import SITL_WITHOUT_REPORT  # noqa: E402
 
@@ -74,35 +73,8 @@ with connect(url, subprotocols=["viser-v" + viser.__version__], max_size=None) a
 """A watcher that draws nothing; it prints a line when it watches, and how many bytes it got."""
 
 
-def say(*words: object) -> None:
-    print(*words, flush=True)
-
-
-def load() -> str:
-    one, five, _ = os.getloadavg()
-    return f"load {one:.1f} (1 min), {five:.1f} (5 min) on {os.cpu_count()} cores"
-
-
-@contextmanager
-def viewed(*, paced: bool) -> Iterator[Viewer]:
-    request = Request(
-        run="bench",
-        port=None,
-        paced=paced,
-        speed=None,
-        steerable=paced,
-        compensable=False,
-        compensated=False,
-    )
-    with closing(Viewer(request)) as viewer:
-        yield viewer
-
-
 def wait_until_shown(page: Page, seconds: float = 60.0) -> None:
-    end = time.monotonic() + seconds
-    while "phase" not in page.text():
-        assert time.monotonic() < end, "the page shows no flight"
-        time.sleep(0.02)
+    wait_for(lambda: "phase" in page.text(), seconds)
 
 
 def measure_lockstep(folder: Path, pairs: int = 4) -> None:
@@ -253,7 +225,7 @@ episodes = 1
 def measure_training(folder: Path, pairs: int = 3) -> None:
     (folder / "bench.toml").write_text(TRAINING, encoding="utf-8")
     ratios, weights = [], set()
-    with viewed(paced=False) as viewer:
+    with viewed() as viewer:
         for k in range(pairs + 1):
             took = {}
             for ends in (None, viewer.ends):
