@@ -144,7 +144,7 @@ class Circle:
         self.vehicle = load_vehicle("quad")
         self.arena = generate(spec, 3, name="dynamic-obstacles", vehicle_width_m=0.55)
         camera = self.vehicle.camera
-        mount = Mount((camera.forward_m, 0.0, -camera.up_m), np.deg2rad(camera.pitch_up_deg))
+        mount = Mount.of(camera)
         intrinsics = Intrinsics.of(camera)
         self._images: list[Image] = []
         for k in range(64):

@@ -108,14 +108,14 @@ def draw_plan(
     Raises:
         UsageError: No such plan was found.
     """
-    rooms = spec.rooms
+    rooms, width_m = spec.rooms, spec.rooms.corridor_width_m
     count = int(rng.integers(*rooms.count, endpoint=True))
     floor = Rect((bounds.north_min, bounds.east_min), (bounds.north_max, bounds.east_max))
     for _ in range(TRIES):
         found = (
             _divided(rng, rooms, floor, count)
-            if rooms.corridor_width_m is None
-            else _on_a_corridor(rng, rooms, floor, count)
+            if width_m is None
+            else _on_a_corridor(rng, rooms, floor, count, width_m)
         )
         if not _any_overlap(_boxes([wall for _, wall in found[1]]), keep_off):
             return Plan(*found, _draw_doors(rng, rooms, *found))
@@ -177,15 +177,16 @@ def _cut(
     return low + cut, min(max(wanted, n - behind, 1), before, n - 1)
 
 
-def _on_a_corridor(rng: np.random.Generator, rooms: Rooms, floor: Rect, count: int) -> _Found:
+def _on_a_corridor(
+    rng: np.random.Generator, rooms: Rooms, floor: Rect, count: int, width_m: float
+) -> _Found:
     """Lay a corridor along the floor, and a row of rooms on either side."""
-    assert rooms.corridor_width_m is not None  # noqa: S101 (this is what was asked for)
     along = 0 if floor.side(0) >= floor.side(1) else 1
     across, thick = 1 - along, rooms.thickness_m
-    free = floor.side(across) - rooms.corridor_width_m - 2.0 * thick
+    free = floor.side(across) - width_m - 2.0 * thick
     depth = rooms.least_side_m + (free - 2.0 * rooms.least_side_m) * float(rng.random())
     begin = floor.low[across] + depth + thick
-    end = begin + rooms.corridor_width_m
+    end = begin + width_m
     slots = rooms.slots(floor.side(along))
     least, most = max(1, count - slots), min(slots, count - 1)
     first = int(rng.integers(least, most, endpoint=True))

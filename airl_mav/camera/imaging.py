@@ -10,6 +10,7 @@ shades. Light beyond white is cut in each of the shorter exposures. Then lens an
 from __future__ import annotations
 
 import math
+from functools import reduce
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -56,13 +57,10 @@ class ImageFormation:
     """Takes the images of one camera with a table `imaging`; its gain may follow the light."""
 
     def __init__(self, camera: Camera) -> None:
-        """Take a camera of kind rgb or grey that has the table."""
-        assert camera.imaging is not None  # noqa: S101 - whoever makes one has looked
-        self._imaging: Imaging = camera.imaging
+        """Take a camera of kind rgb or grey; without the table all of it is off."""
+        self._imaging = camera.imaging or Imaging()
         self._camera = Intrinsics.of(camera)
-        self._mount = Mount(
-            (camera.forward_m, 0.0, -camera.up_m), math.radians(camera.pitch_up_deg)
-        )
+        self._mount = Mount.of(camera)
         self._period_s = camera.period_us / US_PER_S
         share = self._imaging.vignetting
         self._through = vignette(self._camera, share)[..., None] if share else None
@@ -102,12 +100,14 @@ class ImageFormation:
         """Return the light (h, w, channels) of an exposure."""
         asked = self._imaging
         count = asked.samples if asked.exposure_ms else 1
-        total: Light | None = None
-        for k in range(count):
-            since_us = round(US_PER_MS * asked.exposure_ms * ((k + 0.5) / count - 0.5))
-            light = LIGHT_OF[self._codes(arena, elapsed_us + since_us, motion, since_us, gain)]
-            total = light if total is None else total + light
-        assert total is not None  # noqa: S101 - there is one at least
+        moments_us = (
+            round(US_PER_MS * asked.exposure_ms * ((k + 0.5) / count - 0.5)) for k in range(count)
+        )
+        lights = (
+            LIGHT_OF[self._codes(arena, elapsed_us + since_us, motion, since_us, gain)]
+            for since_us in moments_us
+        )
+        total: Light = reduce(np.add, lights)
         return total if count == 1 else total * np.float32(1.0 / count)
 
     def _codes(

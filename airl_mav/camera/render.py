@@ -14,6 +14,7 @@ from airl_mav.camera.fisheye import bent_of, check_meshes
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.raycast import render_depth
 from airl_mav.core.kernels import kernel
+from airl_mav.profiles.camera import Camera
 from airl_mav.vehicle.rotation import Quat, Vec, exponential, multiply, rotate
 
 
@@ -24,6 +25,12 @@ class Mount(NamedTuple):
     """Position of the camera in the body frame FRD [m]."""
     pitch_up: float
     """Angle of the optical axis above the body's forward axis [rad]."""
+
+    @classmethod
+    def of(cls, camera: Camera) -> Mount:
+        """Return how the camera of a vehicle profile is fixed."""
+        offset = (camera.forward_m, 0.0, -camera.up_m)
+        return cls(offset, math.radians(camera.pitch_up_deg))
 
 
 class Motion(NamedTuple):

@@ -90,9 +90,7 @@ class Cameras(Stateful):
         self.period_us = camera.period_us
         self.transport_us = transport_us
         self._noise = noise_of(camera, noise)
-        self._mount = Mount(
-            (camera.forward_m, 0.0, -camera.up_m), float(np.deg2rad(camera.pitch_up_deg))
-        )
+        self._mount = Mount.of(camera)
         self._lens = lens_of(self.intrinsics, camera.range_m)
         self._meshes = MeshesSeen(0) if meshes is None else meshes
         self._colour: ColourImages | None = None

@@ -50,8 +50,8 @@ class Looks:
 
     def __init__(self, n: int) -> None:
         """Know none yet."""
-        self.arenas: list[Arena | None] = [None] * n
-        """Those that it knows the looks of."""
+        self.arenas: dict[int, Arena] = {}
+        """Those that it knows the looks of, by slot."""
         self.batch = _empty(n, OBSTACLE)
         """What the kernel looks at; replaced where an arena has more surfaces than all before."""
         self.images: tuple[ImageFile, ...] = ()

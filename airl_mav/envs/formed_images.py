@@ -44,7 +44,6 @@ class FormedImages:
         """
         for i in np.flatnonzero(who).tolist():
             arena = self._looks.arenas[i]
-            assert arena is not None  # noqa: S101 - an episode has begun in every slot that looks
             motion = Motion(
                 fleet.position[i], fleet.quaternion[i], fleet.velocity[i], fleet.omega[i]
             )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator
 from typing import Any
 
@@ -34,9 +33,7 @@ class TakingCamera:
         """Take the camera of a vehicle profile; it sits on the vehicle as it does there."""
         self._camera, self._intrinsics = camera, Intrinsics.of(camera)
         self._forming = None if camera.imaging is None else ImageFormation(camera)
-        self._mount = Mount(
-            (camera.forward_m, 0.0, -camera.up_m), math.radians(camera.pitch_up_deg)
-        )
+        self._mount = Mount.of(camera)
 
     def __call__(self, arena: Arena, elapsed_us: int, motion: Motion, seed: int) -> Pixels:
         """Return a picture (h, w, 3), or (h, w) of grey; depth in colours.

@@ -17,7 +17,6 @@ from airl_mav.camera.imaging import ImageFormation
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.noise import noise_of, noisy_frame
 from airl_mav.camera.render import Motion, Mount, camera_pose
-from airl_mav.core.constants import DEG
 from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import Vector
 from airl_mav.profiles.camera import Camera
@@ -53,7 +52,7 @@ class SimulatedCamera:
         self._forming = ImageFormation(camera) if camera.imaging is not None else None
         self._seed = seed
         self._intrinsics = Intrinsics.of(camera)
-        self._mount = Mount((camera.forward_m, 0.0, -camera.up_m), camera.pitch_up_deg * DEG)
+        self._mount = Mount.of(camera)
         self._rate_hz, self._max_range = camera.rate_hz, camera.range_m
         self._arena = arena
         self._sequence = 0

@@ -34,9 +34,8 @@ class PolicyCamera:
     @classmethod
     def of(cls, camera: Camera) -> PolicyCamera:
         """Return the camera of a vehicle."""
-        mount = Mount((camera.forward_m, 0.0, -camera.up_m), math.radians(camera.pitch_up_deg))
         range_m = camera.range_m if camera.kind == "depth" else RANGE_M
-        return cls(Intrinsics.of(camera), range_m, mount)
+        return cls(Intrinsics.of(camera), range_m, Mount.of(camera))
 
     @property
     def half_angle_rad(self) -> float:
