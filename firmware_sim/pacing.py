@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from airl_mav.core.clock import Clock, SimClock, WallClock
+from airl_mav.core.scheduling import ask_for_short_slices
 
 MAX_LAG_US = 200_000
 """A greater lag is given up instead of caught up: a burst of ticks would outrun the companion
@@ -66,9 +67,12 @@ class WallPacing:
         """Take the speed: simulated seconds per wall second, > 0.
 
         The calling thread is woken as soon as its waits end; by default Linux takes up to 50 µs
-        more, to wake several threads at once.
+        more, to wake several threads at once. Then it runs before what has the processor for
+        longer: a tick that waits for a whole slice of somebody else's is late by more than its
+        length.
         """
         ctypes.CDLL(None).prctl(PR_SET_TIMERSLACK, ctypes.c_ulong(1), 0, 0, 0)
+        ask_for_short_slices()
         self.clock = WallClock(speed)
         self.slipped_us = 0
         self._stamp_us = 0

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+import platform
 import subprocess
 import sys
 from pathlib import Path
@@ -39,6 +40,32 @@ def test_a_process_gives_way_as_a_session_too(leads: bool) -> None:
         # "/autogroup-1412 nice 7"; that of whoever has started it stays as it is.
         assert group[1:] == ["nice", "7"] and group[0] != before.split()[0]
         assert AUTOGROUP.read_text() == before
+
+
+PACED = """
+import ctypes, platform
+from airl_mav.core.scheduling import SLICE_NS
+from firmware_sim.pacing import WallPacing
+
+def slice_ns():
+    attributes = (ctypes.c_uint64 * 6)()  # struct sched_attr; its fourth word is the slice.
+    number = {"x86_64": 315, "aarch64": 275}[platform.machine()]  # sched_getattr(2)
+    ctypes.CDLL(None).syscall(number, 0, ctypes.byref(attributes), 48, 0)
+    return attributes[3]
+
+before = slice_ns()
+WallPacing(1.0)
+print(before, slice_ns(), SLICE_NS)
+"""
+
+
+@pytest.mark.skipif(platform.machine() not in ("x86_64", "aarch64"), reason="numbers of its calls")
+def test_what_keeps_pace_with_the_wall_clock_runs_soon_after_it_was_woken() -> None:
+    done = subprocess.run([sys.executable, "-c", PACED], check=True, capture_output=True, text=True)
+    before, paced, asked = map(int, done.stdout.split())
+    if not before:
+        pytest.skip("this kernel knows no slices of threads (Linux has them from 6.12 on)")
+    assert paced == asked < before
 
 
 def test_a_view_gives_way() -> None:
