@@ -13,6 +13,7 @@ import numpy as np
 from airl_mav.camera.frame import Frame
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.files import save_arrays
+from airl_mav.profiles.camera_kind import SLOW, Renderer
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import Message, Severity
 from firmware_sim.autopilot.parameter_store import Keeper
@@ -25,6 +26,9 @@ from firmware_sim.mavlink.link import LinkCounters
 from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.mavlink.tlog import TlogWriter
 from firmware_sim.pacing import Pacing
+from firmware_sim.plant.camera_process import CameraProcess
+from firmware_sim.plant.camera_server import SimulatedCamera
+from firmware_sim.plant.onboard_camera import CameraMaker
 from firmware_sim.simulation import EpisodeSetup, Simulation, builtin_autopilot
 
 AUTOSAVE_US = 300_000
@@ -206,6 +210,7 @@ class Firmware:
         self.logs_lost: list[str] = []
         """What was said so of the present episode."""
         self._camera = camera
+        self._slow_camera = CameraProcess()
         self._pacing = pacing
         self._recording = recording
         self._failing = failing
@@ -241,7 +246,7 @@ class Firmware:
 
         Raises:
             UsageError: The episode cannot be flown, or there is no such firmware.
-            FirmwareLostError: External firmware died while it booted.
+            FirmwareLostError: External firmware died while it booted, or what draws images did.
         """
         self.discard()
         self.logs_lost.clear()
@@ -256,6 +261,7 @@ class Firmware:
                 autopilot=autopilot,
                 recording=self._recording,
                 read_by=self._pacing.read_by,
+                camera_by=self._camera_by(setup.aircraft.renderer),
             )
         except BaseException:
             autopilot.close()
@@ -283,6 +289,11 @@ class Firmware:
         # All this took wall time, which is no part of the episode: it starts now.
         self._pacing.restart(simulation.time_us)
         return Loaded(start_us, self.epoch_ns)
+
+    def _camera_by(self, renderer: Renderer) -> CameraMaker:
+        """Return what makes cameras: time that is the wall clock's waits for no image."""
+        paced = self.epoch_ns is not None
+        return self._slow_camera.camera if paced and renderer in SLOW else SimulatedCamera
 
     def _open_flight_log(self, path: Path, start_unix_us: int) -> None:
         """Begin the vehicle's log. Real firmware, which shows nothing, writes its own."""
@@ -318,7 +329,8 @@ class Firmware:
     def step(self) -> None:
         """Wait until the next tick is due, then run it.
 
-        Raises FirmwareLostError when external firmware does not answer.
+        Raises FirmwareLostError when external firmware does not answer, or the process has ended
+        that draws images.
         """
         simulation, flight_stack = self.simulation, self.flight_stack
         if simulation is None:
@@ -386,6 +398,7 @@ class Firmware:
     def close(self) -> None:
         """Release everything."""
         self.discard()
+        self._slow_camera.close()
         self.flight_stack.close()
         if self._camera is not None:
             self._camera.close()

@@ -15,7 +15,10 @@ if TYPE_CHECKING:  # Checking the options of external firmware must not load an 
 
 
 class FirmwareLostError(Exception):
-    """External firmware died, hangs, or sends invalid data: the flight proves nothing."""
+    """The flight proves nothing: external firmware died, hangs, or sends invalid data.
+
+    So it is where a process has died that takes the camera's images.
+    """
 
 
 class FirmwareMissingError(UsageError):

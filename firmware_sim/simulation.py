@@ -29,6 +29,7 @@ from firmware_sim.flight_controller import FlightController
 from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth
 from firmware_sim.plant.camera_server import SimulatedCamera
 from firmware_sim.plant.kinematics import POSITION, QUATERNION, RATES, VELOCITY
+from firmware_sim.plant.onboard_camera import CameraMaker, OnboardCamera
 from firmware_sim.plant.plant import Plant
 from firmware_sim.recording import FlightRecorder, fault_arrays
 
@@ -78,6 +79,7 @@ class Simulation:
         autopilot: FlightController | None = None,
         recording: bool = True,
         read_by: Callable[[int], int] | None = None,
+        camera_by: CameraMaker = SimulatedCamera,
     ) -> None:
         """Put the vehicle at the start.
 
@@ -89,6 +91,7 @@ class Simulation:
             recording: Whether the flight is recorded; if not, it may go on for ever.
             read_by: Tells of what was read from a time on [µs] by when it had arrived [µs], for
                 the record; None = no time passes while it is read.
+            camera_by: Makes the camera.
 
         Raises:
             UsageError: The vehicle's parameter overrides are wrong.
@@ -115,20 +118,15 @@ class Simulation:
             self._let_fail(start_us)
         if self.autopilot.internals is not None:
             self.autopilot.internals.failures = ClientFaults(self._faults_now)
-        self._camera: SimulatedCamera | FailingCamera | None = None
+        self._camera: OnboardCamera | None = None
         """None on an endless floor."""
         if setup.arena is not None:
-            camera = SimulatedCamera(
-                setup.vehicle.camera,
-                setup.arena,
-                start_us,
-                asked.sensors,
-                setup.seed,
-                asked.renderer,
+            camera = setup.vehicle.camera
+            self._camera = camera_by(
+                camera, setup.arena, start_us, asked.sensors, setup.seed, asked.renderer
             )
-            self._camera = camera
             if self.faults is not None:
-                self._camera = FailingCamera(camera, self.faults, setup.seed)
+                self._camera = FailingCamera(self._camera, self.faults, setup.seed)
         self.recorder: FlightRecorder | None = None
         """None = nothing is recorded."""
         if recording:

@@ -17,6 +17,7 @@ from airl_mav.cli.viewing import Viewing, view_of
 from airl_mav.core.ports import LOOPBACK
 from airl_mav.core.progress import DRAWING
 from airl_mav.experiments.live import EXIT_CODES, FlownRun, fly_live
+from airl_mav.profiles.camera_kind import SLOW
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 from airl_mav.scenario.resolved import ResolvedScenario
@@ -110,6 +111,8 @@ def _announce(scenario: ResolvedScenario, console: Console) -> None:
             return
     else:
         _say(console, f"MAVSDK     udpin://{LOOPBACK}:{asked.companion_port} (the companion's)")
+        if asked.renderer in SLOW:
+            _say(console, "camera     path traced in real time: images are as late as they take")
     _say(console, f"QGC        UDP port {asked.ports.gcs_port} (connects by itself)")
     if setup.level == "firmware":
         _say(console, f"firmware   {setup.firmware}")

@@ -103,7 +103,7 @@ def host_figures(
         decisions: Stamps (k,) by column, as in `latency.npz` [simulated µs].
         frame_period_us: Between two camera frames [simulated µs].
         excused: From when to when decisions may be late for what was asked for: faults of the
-            camera, a link or a process [simulated µs].
+            camera, a link or a process, or images that take long to draw [simulated µs].
     """
     kept = None
     if wall_s and speed:

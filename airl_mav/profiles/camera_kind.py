@@ -11,6 +11,9 @@ CameraKind = Literal["depth", "rgb", "grey"]
 Renderer = Literal["raycast", "mitsuba"]
 """What draws images: the ray caster, or Mitsuba's path tracer, its reference for colour."""
 
+SLOW: Final[frozenset[Renderer]] = frozenset({"mitsuba"})
+"""Renderers that take longer for an image than a tick has."""
+
 KINDS: Final[tuple[CameraKind, ...]] = get_args(CameraKind)
 
 CHANNELS: Final[dict[CameraKind, int]] = {"depth": 1, "rgb": 3, "grey": 1}

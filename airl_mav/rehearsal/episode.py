@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.core.clock import WallClock
-from airl_mav.core.constants import US_PER_S
+from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.faults.kinds import LINKS, PROCESSES
 from airl_mav.faults.model import Fault
 from airl_mav.flight.judge import Outcome, Referee
@@ -20,7 +20,9 @@ from airl_mav.flight.record import EpisodeRecord, FaultActed
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.flight.validity import BY_HAND, host_faults, host_figures
 from airl_mav.latency.matching import match_setpoints, stamps_of
+from airl_mav.latency.stages import stage_samples
 from airl_mav.latency.stamps import STAMPS
+from airl_mav.profiles.camera_kind import SLOW
 from airl_mav.rehearsal.channel import Ended, Loaded, State
 from airl_mav.rehearsal.process_faults import ProcessFaults
 from airl_mav.rehearsal.run_folder import TICK_LATENESS, FlownEpisode
@@ -108,8 +110,10 @@ def join_episode(
         lateness_us=latency[TICK_LATENESS],
         decisions=latency,
         frame_period_us=scenario.vehicle.camera.period_us,
-        excused=[(each.from_us, each.to_us) for each in disturbances(record.faults)],
+        excused=_excused(record, scenario),
     )
+    if slow_images(scenario):
+        record = replace(record, notes=(*record.notes, *_told_of_images(latency)))
     if scenario.scenario.validity:
         strangers = arrays["commands/strangers"].tolist()
         record = replace(record, invalid=host_faults(figures, strangers))
@@ -117,6 +121,30 @@ def join_episode(
         notes, invalid = (*record.notes, BY_HAND), (*record.invalid, BY_HAND)
         record = replace(record, notes=notes, invalid=invalid)
     return FlownEpisode(record, trajectory, latency)
+
+
+def slow_images(scenario: ResolvedScenario) -> bool:
+    """Return whether images take longer than a tick, so that they are late in real time."""
+    return scenario.scenario.renderer in SLOW
+
+
+def _excused(record: EpisodeRecord, scenario: ResolvedScenario) -> list[tuple[int, int]]:
+    """Return from when to when decisions may be late for what was asked for [µs]."""
+    if slow_images(scenario):
+        return [(record.started_us, record.ended_us)]
+    return [(each.from_us, each.to_us) for each in disturbances(record.faults)]
+
+
+def _told_of_images(stamps: Mapping[str, NDArray[Any]]) -> tuple[str, ...]:
+    """Return how late the images were that took long to draw."""
+    fetched = stage_samples(stamps)["t1"] / US_PER_MS
+    if not fetched.size:
+        return ()
+    median, most = float(np.median(fetched)), float(fetched.max())
+    return (
+        f"images were path traced, and decoded {median:.0f} ms after their exposure in the median,"
+        f" {most:.0f} ms at most",
+    )
 
 
 def _record(

@@ -158,8 +158,9 @@ class Aircraft(ProfileModel):
     )
     renderer: Renderer = Field(
         default="raycast",
-        description="what draws the images of a colour camera: the ray caster, or at level lockstep"
-        " Mitsuba's path tracer, a hundred times slower",
+        description="what draws the images of a colour camera: the ray caster, or Mitsuba's path"
+        " tracer, a hundred times slower: at level lockstep time waits for it, at level sitl images"
+        " are as late as they take, and fewer; level gym has none",
     )
     firmware: FirmwareName = Field(
         default="builtin",

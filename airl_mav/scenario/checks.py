@@ -8,7 +8,7 @@ from airl_mav.core.errors import FieldError
 from airl_mav.faults.kinds import LINKS
 from airl_mav.faults.model import Fault
 from airl_mav.faults.twin import TWIN, check_twin
-from airl_mav.profiles.camera_kind import Renderer
+from airl_mav.profiles.camera_kind import SLOW, Renderer
 from airl_mav.profiles.sensors import Sensors
 from airl_mav.scenario.aircraft import GREATEST_PORT, HAS_PYBULLET, NO_TWIN, Aircraft, Ports
 from airl_mav.scenario.model import LevelName, Scenario
@@ -42,18 +42,17 @@ def check_level(scenario: Scenario) -> None:
             if (value := getattr(scenario, field)) != getattr(usual, field):
                 raise FieldError(field, value, NO_TWIN)
     check_faults(scenario, level)
-    check_pace(scenario.renderer, level)
+    check_drawing(scenario.renderer, level)
     if level != "lockstep" and scenario.tlogs:
         raise FieldError("tlogs", scenario.tlogs, "at level lockstep")
     if level == "sitl" and scenario.workers is not None:
         raise FieldError("workers", scenario.workers, "at level gym or lockstep")
 
 
-def check_pace(renderer: Renderer, level: LevelName) -> None:
-    """Raise FieldError for a renderer that the level's time does not wait for."""
-    if renderer == "mitsuba" and level != "lockstep":
-        accepted = "raycast, but at level lockstep, where simulated time waits for an image"
-        raise FieldError("renderer", renderer, accepted)
+def check_drawing(renderer: Renderer, level: LevelName) -> None:
+    """Raise FieldError for a renderer that the level cannot have."""
+    if renderer in SLOW and level == TWIN:
+        raise FieldError("renderer", renderer, "raycast, but at level lockstep or sitl")
 
 
 def check_faults(asked: Aircraft, level: LevelName) -> None:

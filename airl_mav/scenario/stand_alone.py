@@ -17,9 +17,9 @@ from airl_mav.faults.kinds import PROCESSES
 from airl_mav.flight.judge import TIME_LIMIT_S, GoalRadius, TimeLimit
 from airl_mav.scenario.aircraft import Aircraft
 from airl_mav.scenario.checks import (
+    check_drawing,
     check_faults,
     check_firmware,
-    check_pace,
     check_plant,
     check_ports,
 )
@@ -264,7 +264,7 @@ def check_vehicle(asked: StandAloneVehicle) -> None:
             "without lockstep; PX4 is flown in lockstep by airl-sitl and from Python",
         )
     check_faults(asked, level)
-    check_pace(asked.renderer, level)
+    check_drawing(asked.renderer, level)
     for fault in asked.faults:
         if fault.part in PROCESSES:
             raise FieldError(

@@ -13,13 +13,13 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.faults.kinds import NOISE_SEED
 from airl_mav.profiles.conditions import SensorNoise
 from firmware_sim.faults.timeline import Acting, FaultTimeline
-from firmware_sim.plant.camera_server import SimulatedCamera
+from firmware_sim.plant.onboard_camera import OnboardCamera
 
 
 class FailingCamera:
     """A camera as the simulation asks for its frames: there only where faults are asked for."""
 
-    def __init__(self, camera: SimulatedCamera, timeline: FaultTimeline, seed: int) -> None:
+    def __init__(self, camera: OnboardCamera, timeline: FaultTimeline, seed: int) -> None:
         """Take the healthy camera, the faults of the episode, and its seed."""
         self._camera = camera
         self._timeline = timeline
@@ -41,7 +41,7 @@ class FailingCamera:
         self._camera.restart(time_us)
 
     def offer(self, time_us: int, motion: Motion, publish: Callable[[Frame], None]) -> None:
-        """Hand the frames that are due to `publish`; see `SimulatedCamera.offer`."""
+        """Hand the frames that are due to `publish`; see `OnboardCamera.offer`."""
         if time_us >= self._camera.next_us:
             self._camera.offer(time_us, motion, lambda frame: self._take(frame, publish))
         while self._late and self._late[0][0] <= time_us:

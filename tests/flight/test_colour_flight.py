@@ -168,8 +168,7 @@ def test_a_flight_sees_what_is_path_traced(policy: Path, tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("changes", "accepted"),
     [
-        ({"level": "sitl"}, "raycast, but at level lockstep"),
-        ({"level": "gym"}, "raycast, but at level lockstep"),
+        ({"level": "gym"}, "raycast, but at level lockstep or sitl"),
         ({"shipped": "static-obstacles", "vehicle": "quad"}, "raycast with a depth camera"),
         ({"arena": "varied-looks"}, "raycast in an arena with fog"),
     ],
