@@ -2,6 +2,8 @@
 
 An exposure that takes time is the mean of images of shorter ones, from where vehicle and obstacles
 are then: its middle is the frame's stamp, and velocity and angular rates are those of that moment.
+With a rolling shutter the rows are exposed one after the other, the first at the top, and the stamp
+is the middle of the middle row's exposure.
 A gain is light: the scene is drawn with all light times the gain, so that dark ones keep their
 shades. Light beyond white is cut in each of the shorter exposures. Then lens and sensor
 (`image_sensor`), and JPEG. The light of a grey pixel is that of its number.
@@ -77,7 +79,8 @@ class ImageFormation:
 
         Args:
             arena: What is seen.
-            elapsed_us: Time since the episode's start, at the middle of the exposure [µs].
+            elapsed_us: Time since the episode's start, at the middle of the exposure [µs]; with a
+                rolling shutter, of that of the middle row.
             motion: How the vehicle moves then.
             seed: Of the episode.
             frame: The image's number in the episode, by the camera's rate: frames that nobody
@@ -97,11 +100,31 @@ class ImageFormation:
         return self._formed(light, self.gain, seed, frame)
 
     def _exposed(self, arena: Arena, elapsed_us: int, motion: Motion, gain: float) -> Light:
-        """Return the light (h, w, channels) of an exposure."""
+        """Return the light (h, w, channels) of all rows, each exposed when the shutter has it."""
+        readout_us = US_PER_MS * self._imaging.readout_ms
+        if not readout_us:
+            return self._exposed_at(arena, elapsed_us, motion, 0.0, gain)
+        height = self._camera.height
+        bands = min(self._imaging.readout_bands, height)
+        channels = 3 if self._camera.kind == "rgb" else 1
+        light = np.empty((height, self._camera.width, channels), np.float32)
+        for k in range(bands):
+            first, end = k * height // bands, (k + 1) * height // bands
+            # The mean of its rows' moments, of which row r's is (r + 1/2) / h of the readout.
+            middle_us = readout_us * (0.5 * (first + end) / height - 0.5)
+            seen = self._exposed_at(arena, elapsed_us, motion, middle_us, gain)
+            light[first:end] = seen[first:end]
+        return light
+
+    def _exposed_at(
+        self, arena: Arena, elapsed_us: int, motion: Motion, middle_us: float, gain: float
+    ) -> Light:
+        """Return the light (h, w, channels) of an exposure, its middle so long after the stamp."""
         asked = self._imaging
         count = asked.samples if asked.exposure_ms else 1
         moments_us = (
-            round(US_PER_MS * asked.exposure_ms * ((k + 0.5) / count - 0.5)) for k in range(count)
+            round(middle_us + US_PER_MS * asked.exposure_ms * ((k + 0.5) / count - 0.5))
+            for k in range(count)
         )
         lights = (
             LIGHT_OF[self._codes(arena, elapsed_us + since_us, motion, since_us, gain)]

@@ -163,6 +163,8 @@ def _check_imaging(imaging: Imaging, camera: Camera) -> None:
         accepted = f"false with a camera of kind {camera.kind!r}"
         raise FieldError("camera.imaging.bayer", True, accepted)
     period_ms = camera.period_us / US_PER_MS
-    if imaging.exposure_ms > period_ms:
-        accepted = f"value <= {period_ms:.4g} ms, the time between two frames"
-        raise FieldError("camera.imaging.exposure_ms", imaging.exposure_ms, accepted)
+    times = (("exposure_ms", imaging.exposure_ms), ("readout_ms", imaging.readout_ms))
+    for name, value in times:
+        if value > period_ms:
+            accepted = f"value <= {period_ms:.4g} ms, the time between two frames"
+            raise FieldError(f"camera.imaging.{name}", value, accepted)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from pydantic import Field, model_validator
+from typing import Any
+
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from airl_mav.core.fields import ProfileModel, quantity
 
@@ -37,6 +39,24 @@ class Imaging(ProfileModel):
         default=0.0,
     )
     samples: int = quantity("images of which an exposure is the mean", "1", ge=1, le=64, default=8)
+    readout_ms: float = quantity(
+        "readout time of a rolling shutter: of h rows, row r is exposed r / h of it later than the"
+        " first. The frame's stamp is the middle of it. 0: a global shutter. No longer than the"
+        " time between two frames",
+        "ms",
+        ge=0,
+        le=1000,
+        default=0.0,
+    )
+    readout_bands: int = quantity(
+        "bands of rows that are exposed together, at most one for each row: a row's moment is right"
+        " to readout_ms / (2 readout_bands), and an image takes so many times as long; only matters"
+        " with readout_ms",
+        "1",
+        ge=1,
+        le=480,
+        default=16,
+    )
     gain: float = quantity(
         "times this the light; 1: a white surface under the irradiance 1 is white",
         "1",
@@ -90,6 +110,15 @@ class Imaging(ProfileModel):
         le=100,
         default=None,
     )
+
+    @model_serializer(mode="wrap")
+    def _without_the_default(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        # Profiles with a global shutter keep their digests.
+        data: dict[str, Any] = dump(self)
+        if not self.readout_ms:
+            data.pop("readout_ms", None)
+            data.pop("readout_bands", None)
+        return data
 
     @model_validator(mode="after")
     def _goes_together(self) -> Imaging:

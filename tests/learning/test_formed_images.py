@@ -55,8 +55,9 @@ def captured(env: Navigation) -> np.ndarray:
     return env.cameras.image.copy()
 
 
-def test_the_plant_s_camera_takes_the_same_image(tmp_path: Path) -> None:
-    env = flown(tmp_path, QUIET)
+@pytest.mark.parametrize("shutter", ["", "readout_ms = 15.0\nreadout_bands = 6"])
+def test_the_plant_s_camera_takes_the_same_image(tmp_path: Path, shutter: str) -> None:
+    env = flown(tmp_path, shutter + QUIET)
     images = captured(env)
     for i, arena in enumerate(env.arenas):
         assert arena is not None

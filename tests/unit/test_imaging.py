@@ -163,6 +163,77 @@ def test_what_moves_is_drawn_out_before_a_camera_at_rest(speed: float) -> None:
     assert np.abs(share - wanted).max() <= 0.5 / 64 + 0.01
 
 
+# --- rolling shutter
+
+ROWS = np.arange(9, 35)
+"""Those in which the sheet is seen."""
+
+LATER_S = 0.05 * ((ROWS + 0.5) / 49.0 - 0.5)
+"""When each is exposed, after the stamp, in a readout of 50 ms."""
+
+
+def begins(image: NDArray[np.uint8]) -> NDArray[np.int64]:
+    """Column in which the sheet begins in each row, before sky, wall or ground."""
+    numbers = image[ROWS, :, 0]
+    sheet = numbers == numbers[:, -1:]
+    assert (np.diff(sheet.astype(int), axis=1) >= 0).all()
+    return np.asarray(np.argmax(sheet, axis=1))
+
+
+def rolled(scene: Arena, motion: Motion, *, at_us: int = 0, **asked: Any) -> NDArray[np.uint8]:
+    rolling = {"readout_ms": 50.0, "readout_bands": 480, **asked}
+    return ImageFormation(camera(**rolling)).take(scene, at_us, motion, 0, 0).image
+
+
+@pytest.mark.parametrize("bands", [1, 4, 480])
+@pytest.mark.parametrize("speed", [-30.0, 30.0])
+def test_an_edge_leans_where_the_vehicle_moves_sideways(speed: float, bands: int) -> None:
+    """By f v / z pixels a second; a band's rows are off by half its time at most."""
+    found = begins(rolled(edge(), moving((0.0, speed, 0.0)), readout_bands=bands))
+    passes = -FOCAL * speed / 5.0
+    off = abs(passes) * 0.05 / (2.0 * bands) if bands < 49 else 0.0
+    # The first column beyond the edge is less than one away.
+    assert np.abs(found - 0.5 - (32.0 + passes * LATER_S)).max() <= 0.5 + off + 1e-3
+    if bands == 480:
+        assert np.polyfit(LATER_S, found, 1)[0] == pytest.approx(passes, rel=0.1)
+
+
+@pytest.mark.parametrize("rate", [-6.0, 6.0])
+def test_an_edge_leans_where_the_vehicle_turns(rate: float) -> None:
+    found = begins(rolled(edge(), moving(rates=(0, 0, rate))))
+    wanted = 32.0 - FOCAL * np.tan(rate * LATER_S)
+    assert np.abs(found - 0.5 - wanted).max() <= 0.5 + 1e-3
+    assert np.ptp(found) >= 4
+
+
+@pytest.mark.parametrize("speed", [-8.0, 8.0])
+def test_what_moves_leans_before_a_camera_at_rest(speed: float) -> None:
+    at_us = 5_000_000 if speed > 0 else 15_000_000
+    found = begins(rolled(edge(speed=abs(speed)), AT_REST, at_us=at_us))
+    wanted = 32.0 + FOCAL * speed / 5.0 * LATER_S
+    assert np.abs(found - 0.5 - wanted).max() <= 0.5 + 1e-2
+    assert np.ptp(found) >= 1
+
+
+def test_each_row_of_a_rolling_shutter_is_blurred_about_its_own_moment() -> None:
+    image = rolled(edge(), moving((0.0, 30.0, 0.0)), exposure_ms=40.0, samples=16)
+    passes = -FOCAL * 30.0 / 5.0
+    dark = (ROWS >= 20) & (ROWS <= 27)  # Behind the sheet is the wall.
+    for row, later_s in zip(ROWS[dark], LATER_S[dark], strict=True):
+        light = LIGHT_OF[image[row, :, 0]]
+        share = (light - light[0]) / (light[-1] - light[0])
+        along = np.arange(65) - (32.0 + passes * later_s)
+        wanted = np.clip(along / abs(passes * 0.04) + 0.5, 0.0, 1.0)
+        assert np.abs(share - wanted).max() <= 0.5 / 16 + 0.01
+
+
+def test_a_rolling_shutter_at_rest_changes_no_bit_and_a_global_one_is_not_written() -> None:
+    plain = ImageFormation(camera()).take(edge(), 0, AT_REST, 0, 0).image
+    np.testing.assert_array_equal(rolled(edge(), AT_REST, readout_bands=5), plain)
+    assert "readout_ms" not in Imaging().model_dump()
+    assert Imaging(readout_ms=3.0).model_dump()["readout_bands"] == 16
+
+
 # --- gain
 
 
@@ -356,6 +427,7 @@ def test_a_jpeg_that_is_none_or_another_is_no_frame() -> None:
         ("depth", {}, "camera.kind.*'depth'.*camera.imaging; accepted: rgb or grey"),
         ("grey", {"bayer": True}, "camera.imaging.bayer.*false with a camera of kind 'grey'"),
         ("rgb", {"exposure_ms": 51.0}, r"camera.imaging.exposure_ms.*51.*value <= 50 ms"),
+        ("rgb", {"readout_ms": 51.0}, r"camera.imaging.readout_ms.*51.*value <= 50 ms"),
         ("rgb", {"read_noise_e": 3.0}, "read_noise_e = 3: accepted: 0 without full_well_e"),
         ("rgb", {"gain": 2.0, "auto_exposure": {}}, "gain = 2: accepted: 1 with a table"),
         ("rgb", {"jpeg_quality": 0}, "jpeg_quality"),
