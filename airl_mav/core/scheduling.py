@@ -38,11 +38,16 @@ def ask_for_short_slices() -> None:
     they have it sooner, and no more of the processor than before. Linux knows this from 6.12 on
     (EEVDF: the slice of a thread is its request); elsewhere nothing happens.
     """
+    _ask_for_slices(SLICE_NS)
+
+
+def _ask_for_slices(length_ns: int) -> None:
+    """Ask for slices of a length [ns], 0: as Linux has them for all."""
     number = _SCHED_SETATTR.get(platform.machine())
     if sys.platform != "linux" or number is None or os.sched_getscheduler(0) != os.SCHED_OTHER:
         return
     nice = os.getpriority(os.PRIO_PROCESS, 0)
-    asked = _Attributes(ctypes.sizeof(_Attributes), 0, 0, nice, 0, SLICE_NS, 0, 0)
+    asked = _Attributes(ctypes.sizeof(_Attributes), 0, 0, nice, 0, length_ns, 0, 0)
     # Refused or not known: nothing depends on it.
     ctypes.CDLL(None).syscall(number, 0, ctypes.byref(asked), 0)
 
@@ -52,12 +57,14 @@ def give_way(niceness: int) -> None:
 
     Linux' autogroups share the processor out among sessions, and niceness counts only within one:
     a nice process of one session takes half of what an urgent one of another could have. So this
-    process becomes a session of its own, and is nice as such, too (sched(7)).
+    process becomes a session of its own, and is nice as such, too (sched(7)). Short slices of
+    whoever has started it are no longer its own.
 
     Args:
         niceness: 1 to 19, the most.
     """
     os.nice(niceness)
+    _ask_for_slices(0)
     with suppress(OSError):  # It leads its process group already, and perhaps its session.
         os.setsid()
     if os.getsid(0) == os.getpid():

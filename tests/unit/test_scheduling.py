@@ -44,7 +44,7 @@ def test_a_process_gives_way_as_a_session_too(leads: bool) -> None:
 
 PACED = """
 import ctypes, platform
-from airl_mav.core.scheduling import SLICE_NS
+from airl_mav.core.scheduling import SLICE_NS, give_way
 from firmware_sim.pacing import WallPacing
 
 def slice_ns():
@@ -55,17 +55,19 @@ def slice_ns():
 
 before = slice_ns()
 WallPacing(1.0)
-print(before, slice_ns(), SLICE_NS)
+paced = slice_ns()
+give_way(7)
+print(before, paced, SLICE_NS, slice_ns())
 """
 
 
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "aarch64"), reason="numbers of its calls")
 def test_what_keeps_pace_with_the_wall_clock_runs_soon_after_it_was_woken() -> None:
     done = subprocess.run([sys.executable, "-c", PACED], check=True, capture_output=True, text=True)
-    before, paced, asked = map(int, done.stdout.split())
+    before, paced, asked, given_way = map(int, done.stdout.split())
     if not before:
         pytest.skip("this kernel knows no slices of threads (Linux has them from 6.12 on)")
-    assert paced == asked < before
+    assert paced == asked < before == given_way
 
 
 def test_a_view_gives_way() -> None:
