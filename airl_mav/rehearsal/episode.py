@@ -20,7 +20,7 @@ from airl_mav.flight.record import EpisodeRecord, FaultActed
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.flight.validity import BY_HAND, host_faults, host_figures
 from airl_mav.latency.matching import match_setpoints, stamps_of
-from airl_mav.latency.stages import stage_samples
+from airl_mav.latency.stages import stage_durations
 from airl_mav.latency.stamps import STAMPS
 from airl_mav.profiles.camera_kind import SLOW
 from airl_mav.rehearsal.channel import Ended, Loaded, State
@@ -136,14 +136,17 @@ def _excused(record: EpisodeRecord, scenario: ResolvedScenario) -> list[tuple[in
 
 
 def _told_of_images(stamps: Mapping[str, NDArray[Any]]) -> tuple[str, ...]:
-    """Return how late the images were that took long to draw."""
-    fetched = stage_samples(stamps)["t1"] / US_PER_MS
-    if not fetched.size:
+    """Return how many images were decided on that took long to draw, and how late they were."""
+    late, fetched_us = stage_durations(stamps)["t1"]
+    if not fetched_us.size:
         return ()
-    median, most = float(np.median(fetched)), float(fetched.max())
+    exposed_us = np.unique(stamps["capture_us"][late])
+    span_us = int(np.ptp(exposed_us))
+    often = f", {(len(exposed_us) - 1) * US_PER_S / span_us:.1f} a second" if span_us else ""
+    median, most = (each / US_PER_MS for each in (np.median(fetched_us), fetched_us.max()))
     return (
-        f"images were path traced, and decoded {median:.0f} ms after their exposure in the median,"
-        f" {most:.0f} ms at most",
+        f"{len(exposed_us)} path-traced images were decided on{often}, and decoded {median:.0f} ms"
+        f" after their exposure in the median, {most:.0f} ms at most",
     )
 
 

@@ -8,7 +8,6 @@ left out. Only where time is that of the wall clock: elsewhere it waits for an i
 from __future__ import annotations
 
 import os
-import select
 import subprocess
 import sys
 from collections.abc import Callable
@@ -16,6 +15,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
+from queue import SimpleQueue
+from threading import Thread
 
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.frame import Frame
@@ -64,7 +65,8 @@ class CameraProcess:
         """Start nothing yet."""
         self._line: Connection | None = None
         self._process: subprocess.Popen[bytes] | None = None
-        self._readable = select.poll()
+        self._answers: SimpleQueue[_Taken | EOFError | None] = SimpleQueue()
+        self._reading: Thread | None = None
 
     def camera(
         self,
@@ -100,12 +102,23 @@ class CameraProcess:
                 stdout=subprocess.DEVNULL,  # That of the firmware may be a channel.
                 pass_fds=[theirs.fileno()],
             )
-        self._readable.register(self._line.fileno(), select.POLLIN)
+        self._reading = Thread(target=self._read, args=(self._line,), name="images", daemon=True)
+        self._reading.start()
+
+    def _read(self, line: Connection) -> None:
+        """Take in what arrives until the process has ended.
+
+        An image is larger than what fits into the line: who reads it waits for one that gives way.
+        """
+        with suppress(EOFError, OSError):
+            while True:
+                self._answers.put(line.recv())
+        self._answers.put(EOFError())
 
     @property
     def answers(self) -> bool:
         """Whether something has arrived, or the process has ended."""
-        return bool(self._readable.poll(0))
+        return not self._answers.empty()
 
     def send(self, what: object) -> None:
         """Ask for something. Raises FirmwareLostError."""
@@ -120,11 +133,11 @@ class CameraProcess:
         """Wait for the next answer; None: a camera is ready. Raises FirmwareLostError."""
         if self._line is None:
             raise self._lost()
-        try:
-            taken: _Taken | None = self._line.recv()
-        except (EOFError, OSError):
-            raise self._lost() from None
-        return taken
+        answer = self._answers.get()
+        if isinstance(answer, EOFError):
+            self._answers.put(answer)
+            raise self._lost()
+        return answer
 
     def _lost(self) -> FirmwareLostError:
         what = "the process that draws the camera's images "
@@ -136,12 +149,12 @@ class CameraProcess:
 
     def close(self) -> None:
         """End the process. Harmless when called again."""
-        if self._line is not None and self._process is not None:
-            self._readable.unregister(self._line.fileno())
-            self._line.close()
+        if self._line is not None and self._process is not None and self._reading is not None:
             self._process.kill()
             self._process.wait()
-        self._line = self._process = None
+            self._reading.join()
+            self._line.close()
+        self._line = self._process = self._reading = None
 
 
 class SlowCamera:

@@ -312,12 +312,12 @@ def test_path_traced_images_come_late_and_the_flight_says_so(tmp_path: Path) -> 
     done = sitl(tmp_path, *words, *seen, report=False)
     (episode,) = done.episodes
     assert not episode["invalid"]
-    (note,) = (each for each in episode["notes"] if "path traced" in each)
-    assert note in done.output
+    (note,) = (each for each in episode["notes"] if "path-traced" in each)
+    assert note in " ".join(done.output.split())
     archive = done.arrays("latency.npz")
     stamps = {key: archive[f"000/{key}"] for key in ("capture_us", "decoded_us")}
     known = (stamps["capture_us"] != NO_STAMP) & (stamps["decoded_us"] != NO_STAMP)
     age_us = (stamps["decoded_us"] - stamps["capture_us"])[known]
-    # Longer than from the ray caster by far, and as the note has it.
-    assert np.median(age_us) > 10_000
+    assert (age_us > 0).all()
+    assert note.startswith(f"{len(np.unique(stamps['capture_us'][known]))} path-traced images")
     assert f"decoded {np.median(age_us) / 1e3:.0f} ms after their exposure" in note
