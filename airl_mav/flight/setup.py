@@ -42,4 +42,4 @@ class Setup:
     computer_on_ground: bool = False
     """The computer is ground equipment: the aircraft carries and feeds none."""
     conditions: str = ""
-    """Wind, load, spread, noise and charge, where they are not the defaults: `wind.east_m_s 4`."""
+    """Wind, load, spread, noise, charge and renderer, where not the defaults: `wind.east_m_s 4`."""

@@ -279,6 +279,8 @@ def _conditions(scenario: Aircraft) -> Iterator[str]:
     for table in ("payload", "wind", "spread", "sensors"):
         for name, value in getattr(scenario, table).model_dump(exclude_defaults=True).items():
             yield f"{table}.{name} {value:g}"
+    if scenario.renderer != "raycast":
+        yield f"renderer {scenario.renderer}"
     if scenario.battery_charge < 1.0:
         yield f"battery_charge {scenario.battery_charge:g}"
     yield from (f"fault: {fault}" for fault in scenario.faults)

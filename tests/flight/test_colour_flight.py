@@ -153,6 +153,7 @@ def test_a_flight_sees_what_is_path_traced(policy: Path, tmp_path: Path) -> None
     images: dict[str, np.ndarray] = {}
     for name, renderer in (("cast", "raycast"), ("traced", "mitsuba"), ("again", "mitsuba")):
         asked = scenario(policy, vehicle=str(small), renderer=renderer, time_limit_s=1.5)
+        assert ("renderer mitsuba" in asked.setup.conditions) == (renderer == "mitsuba")
         seen: list[Observation] = []
         learned = asked.fresh_policy(SEED)
         assert isinstance(learned, LearnedPolicy)
