@@ -53,6 +53,7 @@ def slice_ns():
     ctypes.CDLL(None).syscall(number, 0, ctypes.byref(attributes), 48, 0)
     return attributes[3]
 
+give_way(1)  # Whoever has started this may have asked for short ones.
 before = slice_ns()
 WallPacing(1.0)
 paced = slice_ns()
