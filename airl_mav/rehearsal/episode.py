@@ -112,7 +112,7 @@ def join_episode(
         frame_period_us=scenario.vehicle.camera.period_us,
         excused=_excused(record, scenario),
     )
-    if slow_images(scenario):
+    if _slow_images(scenario):
         record = replace(record, notes=(*record.notes, *_told_of_images(latency)))
     if scenario.scenario.validity:
         strangers = arrays["commands/strangers"].tolist()
@@ -123,14 +123,14 @@ def join_episode(
     return FlownEpisode(record, trajectory, latency)
 
 
-def slow_images(scenario: ResolvedScenario) -> bool:
+def _slow_images(scenario: ResolvedScenario) -> bool:
     """Return whether images take longer than a tick, so that they are late in real time."""
     return scenario.scenario.renderer in SLOW
 
 
 def _excused(record: EpisodeRecord, scenario: ResolvedScenario) -> list[tuple[int, int]]:
     """Return from when to when decisions may be late for what was asked for [µs]."""
-    if slow_images(scenario):
+    if _slow_images(scenario):
         return [(record.started_us, record.ended_us)]
     return [(each.from_us, each.to_us) for each in disturbances(record.faults)]
 

@@ -204,17 +204,15 @@ def main(number: int) -> None:
     give_way(NICENESS)
     line = Connection(number)
     with suppress(EOFError, OSError):
-        taking = SimulatedCamera(*line.recv())
-        line.send(None)
         while True:
             match line.recv():
+                case tuple(episode):
+                    taking = SimulatedCamera(*episode)
+                    line.send(None)
                 case _Restart(time_us):
                     taking.restart(time_us)
                 case _Take(time_us, motion):
                     frame = taking.take(time_us, motion)
                     line.send(_Taken(frame, taking.next_us))
-                case episode:
-                    taking = SimulatedCamera(*episode)
-                    line.send(None)
     # Nothing is left to be done: taking a renderer's threads down would only take time.
     os._exit(0)
