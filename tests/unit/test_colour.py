@@ -14,6 +14,7 @@ from airl_mav.arena.appearance import FLOOR, OBSTACLE, TEXTURES, Drawn, linear_o
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape
 from airl_mav.camera import primitives
+from airl_mav.camera.colour import unpack
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.picture import Picture, grey, render_picture
 from airl_mav.camera.render import render
@@ -422,3 +423,13 @@ def test_same_arena_same_image() -> None:
     np.testing.assert_array_equal(a, b)
     assert len(np.unique(a.reshape(-1, 3), axis=0)) > 200
     assert OBSTACLE + len(scene.obstacles) == len(scene.look.finish.texture)
+
+
+@pytest.mark.parametrize(("width", "height"), [(8, 6), (9, 7), (10, 9), (11, 8)])
+def test_packed_pixels_are_unpacked_whatever_their_number(width: int, height: int) -> None:
+    """Words of four pixels, and what is no whole number of them, beside numpy's bytes."""
+    colours = np.random.default_rng(width).integers(0, 1 << 24, width * height, dtype=np.int32)
+    rgb = np.zeros((height, width, 3), np.uint8)
+    unpack(rgb, colours, False)
+    expected = (colours[:, None] >> np.array([0, 8, 16])) & 255
+    np.testing.assert_array_equal(rgb.reshape(-1, 3), expected)
