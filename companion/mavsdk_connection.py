@@ -29,15 +29,19 @@ RAW_TIMEOUT_S = 3600.0
 wall time: a process that was stopped must not repeat commands when it resumes."""
 
 
-def open_connection(url: str, kind: ComponentType) -> Mavsdk:
+def open_connection(url: str, kind: ComponentType, system_id: int | None = None) -> Mavsdk:
     """Return MAVSDK on a connection, with a component type in its heartbeat.
 
-    The URL is such as `udpin://127.0.0.1:14540`, `serial:///dev/ttyAMA0:921600` or `raw://`.
-    Raises UsageError if it is invalid or its port is taken.
+    The URL is such as `udpin://127.0.0.1:14540`, `serial:///dev/ttyAMA0:921600` or `raw://`. A
+    system id is that of the vehicle which the component is part of; None: MAVSDK's own for its
+    type. Raises UsageError if the URL is invalid or its port is taken.
     """
     # MAVSDK would log to standard output; errors are returned as results.
     log_subscribe(lambda *_: True)
-    mavsdk = Mavsdk(Configuration.create_with_component_type(kind))
+    configuration = Configuration.create_with_component_type(kind)
+    if system_id is not None:
+        configuration.system_id = system_id
+    mavsdk = Mavsdk(configuration)
     result = mavsdk.add_any_connection(url)
     if result == ConnectionResult.SUCCESS:
         return mavsdk

@@ -33,6 +33,7 @@ SUBCOMMANDS: dict[str, str] = {
     "export": "turn a stable-baselines3 model into a policy folder",
     "sweep": "train and evaluate many networks: the architecture search",
     "view": "replay the flights of a run in a browser",
+    "video": "what the camera sees, in QGroundControl and other players of RTP",
     "export-log": "flights of a run as MCAP for Foxglove and rerun, or ULog; or live",
     "report": "a run's tables and page again, or a comparison of several runs",
     "refit": "vehicle and computer profiles from a recorded flight",

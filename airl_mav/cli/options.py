@@ -363,7 +363,9 @@ EXTRAS = {
 }
 """What the extras install, by their names in pyproject.toml."""
 
-LIGHT = ("companion", "computers", "conformance", "export", "listing", "profile", "train")
+LIGHT = (
+    *("companion", "computers", "conformance", "export", "listing", "profile", "train", "video"),
+)
 """Commands whose modules need no simulator; those of the others cannot be imported without."""
 
 

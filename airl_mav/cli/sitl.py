@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,13 +12,14 @@ from pydantic import Field
 from rich.console import Console
 
 from airl_mav.cli.gate import Gate, leave, requirements_of
-from airl_mav.cli.options import RENAMED, run_command, scenario_of
+from airl_mav.cli.options import RENAMED, check_installed, run_command, scenario_of
 from airl_mav.cli.telling import Telling, Voice
 from airl_mav.cli.viewing import Viewing, view_of
 from airl_mav.core.ports import LOOPBACK
 from airl_mav.core.progress import DRAWING
 from airl_mav.experiments.live import EXIT_CODES, FlownRun, fly_live
 from airl_mav.profiles.camera_kind import SLOW
+from airl_mav.rehearsal.video import video_shown, video_words
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 from airl_mav.scenario.resolved import ResolvedScenario
@@ -47,6 +49,12 @@ class SitlOptions(Gate, Viewing, Telling, Scenario):
         " default runs/<UTC time>-<level>-<policy>",
     )
 
+    video: str | None = Field(
+        default=None,
+        description="show what the camera sees as a video, to HOST:PORT; 127.0.0.1:5600 is where"
+        " QGroundControl on this machine listens",
+    )
+
 
 OPTIONS = SitlOptions
 RENAMED_OPTIONS = {**RENAMED, "--lockstep": ("--level", "lockstep")}
@@ -62,7 +70,8 @@ def run(options: SitlOptions, console: Console | None = None) -> int:
     requirements = requirements_of(options, reference=False)
     view = view_of(options)
     scenario = resolve(scenario_of(options))
-    with voice:
+    film = video_of(options, scenario.scenario, partial(_say, voice.console))
+    with voice, film:
         flown = fly_live(
             scenario,
             options.out,
@@ -72,6 +81,24 @@ def run(options: SitlOptions, console: Console | None = None) -> int:
         )
         judged = conclude(flown, options, requirements, voice)
     return EXIT_CODES[flown.ended] or judged
+
+
+def video_of(
+    options: SitlOptions, asked: Scenario, say: Callable[[str], None]
+) -> AbstractContextManager[None]:
+    """Return what shows the camera's video while it lasts, if that is asked for.
+
+    Raises:
+        UsageError: The camera cannot be shown, the address is none, or PyAV is not installed.
+    """
+    if options.video is None:
+        return nullcontext()
+    check_installed("film")
+    # Imported here: MAVSDK is loaded by those who fly alone.
+    from airl_mav.cli.video import watcher_of
+
+    watcher_of(options.video, "video")
+    return video_shown(video_words(asked, options.video), say)
 
 
 def conclude(flown: FlownRun, gate: Gate, requirements: Sequence[Requirement], voice: Voice) -> int:

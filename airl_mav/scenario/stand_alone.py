@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -151,6 +151,17 @@ Start = Literal["arm", "offboard"]
 """Who begins a flight: the companion, or a pilot."""
 
 
+CameraName = Annotated[
+    str,
+    Field(
+        description="depth camera: the ZeroMQ address of its publisher (tcp://HOST:PORT, ipc://PATH);"
+        " realsense, realsense:SERIAL or realsense:FILE.bag; oak-d or oak-d:DEVICE (its id, or its"
+        " network address); a topic of ROS 2, ros2:/TOPIC, or a recording, rosbag:PATH; a driver of"
+        " your own, FILE.py:NAME or MODULE:NAME"
+    ),
+]
+
+
 class CompanionAddresses(ProfileModel):
     """Where a companion by itself finds the flight controller and the camera."""
 
@@ -159,13 +170,7 @@ class CompanionAddresses(ProfileModel):
         description="MAVSDK connection to the flight controller: udpin://HOST:PORT or"
         " serial://DEVICE:BAUD",
     )
-    camera: str = Field(
-        default="tcp://127.0.0.1:5600",
-        description="depth camera: the ZeroMQ address of its publisher (tcp://HOST:PORT, ipc://PATH);"
-        " realsense, realsense:SERIAL or realsense:FILE.bag; oak-d or oak-d:DEVICE (its id, or its"
-        " network address); a topic of ROS 2, ros2:/TOPIC, or a recording, rosbag:PATH; a driver of"
-        " your own, FILE.py:NAME or MODULE:NAME",
-    )
+    camera: CameraName = "tcp://127.0.0.1:5600"
 
 
 class StandAloneCompanion(CompanionAddresses, Lateness, Decisions):

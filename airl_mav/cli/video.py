@@ -1,0 +1,91 @@
+"""`airl video`: what the camera sees, for QGroundControl and every player of RTP."""
+
+from __future__ import annotations
+
+import signal
+import socket
+import threading
+from contextlib import ExitStack, closing
+
+from pydantic import Field
+from rich.console import Console
+
+from airl_mav.cli.options import run_command
+from airl_mav.core.clock import WallClock
+from airl_mav.core.console import new_console
+from airl_mav.core.errors import FieldError
+from airl_mav.core.fields import ProfileModel
+from airl_mav.core.scheduling import give_way
+from airl_mav.profiles.vehicle import load_vehicle
+from airl_mav.scenario.aircraft import DEFAULT_VEHICLE, GREATEST_PORT, VehicleName
+from airl_mav.scenario.stand_alone import CameraName
+from companion.video_program import GIMBAL_PORT, OnNetwork, Watcher, show_video
+
+
+class VideoOptions(ProfileModel):
+    """Show what a camera sees in QGroundControl, or any player of RTP; Ctrl-C ends it.
+
+    Ground stations are told of the camera by MAVLink's camera protocol and need no settings.
+
+    Examples:
+        airl video
+        airl video --to 192.168.1.5:5600 --connect udpin://0.0.0.0:13280
+        airl video --vehicle my-quad.toml --camera realsense
+    """
+
+    camera: CameraName = "tcp://127.0.0.1:5600"
+    vehicle: VehicleName = DEFAULT_VEHICLE
+    to: str = Field(
+        default="127.0.0.1:5600",
+        description="HOST:PORT of who watches: UDP, H.264 in RTP; QGroundControl listens on 5600",
+    )
+    connect: str | None = Field(
+        default=f"udpin://127.0.0.1:{GIMBAL_PORT}",
+        description="MAVSDK connection over which the flight controller forwards the camera's"
+        " messages, by default that of PX4 SITL for a gimbal; None: no ground station is told",
+    )
+
+
+NICENESS = 10
+"""Whatever decides or flies on this computer runs first."""
+
+OPTIONS = VideoOptions
+EXTRAS = ("film",)
+
+
+def run(options: VideoOptions, console: Console | None = None) -> int:
+    """Send the video until Ctrl-C. Exit status: 0."""
+    console = console or new_console(soft_wrap=True)
+    watcher = watcher_of(options.to)
+    profile, clock = load_vehicle(options.vehicle), WallClock()
+    with ExitStack() as held:
+        network = None
+        if options.connect is not None:
+            network = held.enter_context(closing(OnNetwork(options.connect, clock)))
+        give_way(NICENESS)
+        stop = threading.Event()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda *_: stop.set())
+        sent = show_video(
+            *(options.camera, options.vehicle, profile, watcher, network, clock, stop),
+            lambda text: console.print(text, highlight=False),
+        )
+    console.print(f"{sent} pictures sent", highlight=False)
+    return 0
+
+
+def watcher_of(address: str, field: str = "to") -> Watcher:
+    """Return the address of HOST:PORT. Raises FieldError, naming the field, for a wrong one."""
+    host, _, port = address.rpartition(":")
+    # RTCP goes to the port after it.
+    if not host or not port.isdecimal() or not 1 <= int(port) < GREATEST_PORT:
+        raise FieldError(field, address, f"HOST:PORT, port 1..{GREATEST_PORT - 1}")
+    try:
+        socket.getaddrinfo(host, int(port), type=socket.SOCK_DGRAM)
+    except OSError as error:
+        raise FieldError(field, address, problem=f"no such host: {error.strerror}") from None
+    return Watcher(host, int(port))
+
+
+if __name__ == "__main__":
+    run_command("airl video", "airl_mav.cli.video")

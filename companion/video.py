@@ -1,0 +1,114 @@
+"""What a camera sees as a video for people: H.264 over RTP, which ground stations show."""
+
+from __future__ import annotations
+
+import math
+from contextlib import suppress
+from fractions import Fraction
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.camera.frame import MM_PER_M, Frame, rgb_of
+from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.core.constants import US_PER_S
+
+LEAST_PX: Final = 320
+"""A picture is enlarged by a whole factor until it is at least so wide, each pixel a square."""
+
+KEYFRAME_S: Final = 1.0
+"""Whoever begins to watch sees a picture after this time at most [s]."""
+
+CRF: Final = 23
+"""Quality of x264, its own default: 0 has no loss, 51 is the worst."""
+
+_CLOCK_HZ: Final = 90_000
+"""Time stamps of H.264 in RTP (RFC 6184)."""
+
+
+def picture_of(frame: Frame, range_m: float) -> NDArray[np.uint8]:
+    """Return a frame as a picture (h, w, 3) of even sides, at least `LEAST_PX` wide.
+
+    Depth is grey: near is bright, by the square root, which shows near things best; what has no
+    return is black.
+
+    Args:
+        frame: Of the camera.
+        range_m: Farthest depth that the camera returns [m]; of a depth camera alone.
+    """
+    if frame.intrinsics.kind == "depth":
+        share = np.sqrt(np.clip(frame.image / (MM_PER_M * range_m), 0.0, 1.0))
+        grey = np.where(frame.image == 0, 0.0, 255.0 - 223.0 * share).astype(np.uint8)
+        picture = rgb_of(grey[..., None])
+    else:
+        picture = rgb_of(frame.image)
+    times = enlargement(frame.intrinsics)
+    larger = picture.repeat(times, axis=0).repeat(times, axis=1)
+    # H.264 with subsampled colour has even sides only.
+    height, width = larger.shape[0] // 2 * 2, larger.shape[1] // 2 * 2
+    return np.ascontiguousarray(larger[:height, :width])
+
+
+def enlargement(lens: Intrinsics) -> int:
+    """Return by what factor a picture is enlarged each way."""
+    least = max(LEAST_PX / lens.width, 2.0 / lens.height)
+    return max(1, math.ceil(least))
+
+
+def picture_size(lens: Intrinsics) -> tuple[int, int]:
+    """Return width and height of the pictures of a camera [px]."""
+    times = enlargement(lens)
+    return lens.width * times // 2 * 2, lens.height * times // 2 * 2
+
+
+class RtpVideo:
+    """Encodes pictures as they come, and sends them to one address."""
+
+    def __init__(self, host: str, port: int, size: tuple[int, int], rate_hz: float) -> None:
+        """Open a stream; nothing is sent yet.
+
+        Args:
+            host: Who watches.
+            port: UDP port; that after it gets RTCP.
+            size: Width and height of the pictures [px], even numbers.
+            rate_hz: Pictures a second, about: what the encoder divides its bits by.
+
+        Raises:
+            ImportError: PyAV is not installed.
+            OSError: The address cannot be sent to.
+        """
+        import av
+
+        self._av = av
+        self._container = av.open(f"rtp://{host}:{port}", "w", format="rtp")
+        self._stream: Any = self._container.add_stream("libx264", Fraction(round(rate_hz)))
+        self._stream.width, self._stream.height = size
+        self._stream.pix_fmt = "yuv420p"
+        self._stream.codec_context.time_base = Fraction(1, _CLOCK_HZ)
+        self._stream.codec_context.gop_size = max(1, round(KEYFRAME_S * rate_hz))
+        # One slice a picture and none held back: the picture leaves as it comes.
+        self._stream.options = {"preset": "ultrafast", "tune": "zerolatency", "crf": f"{CRF}"}
+        self._stream.codec_context.thread_count = 1
+        self._first_us: int | None = None
+        self._last_pts = -1
+
+    def show(self, picture: NDArray[np.uint8], time_us: int) -> None:
+        """Send a picture (h, w, 3) that was taken at a time [µs]; one that is older is left out.
+
+        Raises OSError when it cannot be sent.
+        """
+        if self._first_us is None:
+            self._first_us = time_us
+        pts = (time_us - self._first_us) * _CLOCK_HZ // US_PER_S
+        if pts <= self._last_pts:
+            return
+        self._last_pts = pts
+        image = self._av.VideoFrame.from_ndarray(picture, format="rgb24")
+        image.pts, image.time_base = pts, Fraction(1, _CLOCK_HZ)
+        self._container.mux(self._stream.encode(image))
+
+    def close(self) -> None:
+        """End the stream."""
+        with suppress(OSError):
+            self._container.close()
