@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from contextlib import suppress
 from fractions import Fraction
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,10 @@ from numpy.typing import NDArray
 from airl_mav.camera.frame import MM_PER_M, Frame, rgb_of
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.constants import US_PER_S
+
+GIMBAL_PORT: Final = 13_280
+"""Where PX4 SITL's instance 0 sends what it forwards to a gimbal (px4-rc.mavlink), and the built-in
+flight controller of `airl-firmware`, too: a link that is fast enough, and is nobody else's here."""
 
 LEAST_PX: Final = 320
 """A picture is enlarged by a whole factor until it is at least so wide, each pixel a square."""
@@ -25,6 +29,13 @@ CRF: Final = 23
 
 _CLOCK_HZ: Final = 90_000
 """Time stamps of H.264 in RTP (RFC 6184)."""
+
+
+class Watcher(NamedTuple):
+    """Who is sent the video."""
+
+    host: str
+    port: int
 
 
 def picture_of(frame: Frame, range_m: float) -> NDArray[np.uint8]:

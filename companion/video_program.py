@@ -6,7 +6,7 @@ import math
 import threading
 from collections.abc import Callable
 from contextlib import closing
-from typing import Any, NamedTuple
+from typing import Any
 
 from mavsdk import ComponentType, Mavsdk
 
@@ -17,24 +17,13 @@ from companion.camera import FrameSource, ReceivedFrame
 from companion.camera_component import CameraComponent, Stream
 from companion.cameras.by_name import open_named_camera
 from companion.mavsdk_connection import open_connection
-from companion.video import RtpVideo, picture_of, picture_size
+from companion.video import RtpVideo, Watcher, picture_of, picture_size
 
 WAIT_S = 0.5
 """Longest single wait for a frame [wall s]: so soon a wish to end is seen."""
 
-GIMBAL_PORT = 13_280
-"""Where PX4 SITL's instance 0 sends what it forwards to a gimbal (px4-rc.mavlink), and the built-in
-flight controller of `airl-firmware`, too: a link that is fast enough, and is nobody else's here."""
-
 DEFAULT_SYSTEM_ID = 1
 """Of vehicles whose MAV_SYS_ID nobody has changed, and of MAVSDK's camera component."""
-
-
-class Watcher(NamedTuple):
-    """Who is sent the video."""
-
-    host: str
-    port: int
 
 
 class OnNetwork:

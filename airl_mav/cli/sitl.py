@@ -14,6 +14,7 @@ from rich.console import Console
 from airl_mav.cli.gate import Gate, leave, requirements_of
 from airl_mav.cli.options import RENAMED, check_installed, run_command, scenario_of
 from airl_mav.cli.telling import Telling, Voice
+from airl_mav.cli.video import watcher_of
 from airl_mav.cli.viewing import Viewing, view_of
 from airl_mav.core.ports import LOOPBACK
 from airl_mav.core.progress import DRAWING
@@ -94,9 +95,6 @@ def video_of(
     if options.video is None:
         return nullcontext()
     check_installed("film")
-    # Imported here: MAVSDK is loaded by those who fly alone.
-    from airl_mav.cli.video import watcher_of
-
     watcher_of(options.video, "video")
     return video_shown(video_words(asked, options.video), say)
 

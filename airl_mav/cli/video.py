@@ -19,7 +19,7 @@ from airl_mav.core.scheduling import give_way
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.aircraft import DEFAULT_VEHICLE, GREATEST_PORT, VehicleName
 from airl_mav.scenario.stand_alone import CameraName
-from companion.video_program import GIMBAL_PORT, OnNetwork, Watcher, show_video
+from companion.video import GIMBAL_PORT, Watcher
 
 
 class VideoOptions(ProfileModel):
@@ -55,6 +55,9 @@ EXTRAS = ("film",)
 
 def run(options: VideoOptions, console: Console | None = None) -> int:
     """Send the video until Ctrl-C. Exit status: 0."""
+    # Imported here: help needs no MAVSDK.
+    from companion.video_program import OnNetwork, show_video
+
     console = console or new_console(soft_wrap=True)
     watcher = watcher_of(options.to)
     profile, clock = load_vehicle(options.vehicle), WallClock()

@@ -12,7 +12,7 @@ from airl_mav.core.child_process import ChildProcess
 from airl_mav.core.errors import FieldError
 from airl_mav.core.ports import LOOPBACK
 from airl_mav.scenario.model import Scenario
-from companion.video_program import GIMBAL_PORT
+from companion.video import GIMBAL_PORT
 
 MODULE = "airl_mav.cli.video"
 

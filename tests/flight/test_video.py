@@ -23,8 +23,7 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.errors import EXIT_INTERRUPTED, FieldError, UsageError
 from airl_mav.rehearsal.video import video_words
 from airl_mav.scenario.model import Scenario
-from companion.video import RtpVideo, picture_of, picture_size
-from companion.video_program import GIMBAL_PORT
+from companion.video import GIMBAL_PORT, RtpVideo, picture_of, picture_size
 from firmware_sim.mavlink.link import gimbal_link
 from firmware_sim.mavlink.udp_links import DEVICE_PORTS
 from tests.support.command_line import airl
