@@ -76,6 +76,10 @@ class EventSender:
         self._announced_us = 0
         self._first = len(buffer) == 0
 
+    def has_news(self, now_us: int) -> bool:
+        """Return whether anything is to be sent at simulated `now_us` [µs]: mostly there is not."""
+        return self._sent != self._buffer.latest or now_us - self._announced_us > ANNOUNCED_US
+
     def due(self, now_us: int) -> Iterator[WireMessage]:
         """Yield what is to be sent at simulated `now_us` [µs]."""
         latest = self._buffer.latest

@@ -183,16 +183,18 @@ class MavlinkServer:
         texts = list(dict.fromkeys(port.take_messages()))  # once a tick; as `_announce`
         for event in port.take_events():
             self._events.add(event, now_us)
-        self._send_pending(now_us)
+        everyone = list(self._all())
+        self._send_pending(everyone, now_us)
         state: AutopilotState | None = None
         payloads: Payloads = {}
         for clients in self._links:
             clients.renew()
-        due = [(client, client.due(now_us)) for client in self._all()]
+        due = [(client, client.due(now_us)) for client in everyone]
         share = _share([len(names) for _, names in due])
         for client, names in due:
             link = client.link
-            _stream_news(client, texts, now_us)
+            if texts or (client.events is not None and client.events.has_news(now_us)):
+                _stream_news(client, texts, now_us)
             if len(names) > share:
                 names, client.late = names[:share], names[share:]
             if names or client.announced_origin is None:
@@ -213,12 +215,11 @@ class MavlinkServer:
             if self._stored is not None:
                 self._stored.save_due()
 
-    def _send_pending(self, now_us: int) -> None:
+    def _send_pending(self, clients: Sequence[Client], now_us: int) -> None:
         """Send clients what is next of what they get piece by piece.
 
         Who comes too late for this tick is first in the next.
         """
-        clients = list(self._all())
         first = self._first_in_turn
         sent = 0
         for turn in range(len(clients)):
