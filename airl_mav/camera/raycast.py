@@ -86,7 +86,7 @@ def _draw_obstacle(
     span = (0.0, 0.0, 0, 0)
     rectangle = (0, 0, 0, 0)
     if bent is not None:
-        rectangle = fisheye_rectangle(out, view, pose, half, sphere)
+        rectangle = fisheye_rectangle(out, view, bent, pose, half, sphere)
     elif view.cylindrical:
         # What is behind the camera may be at both ends of the image.
         turns = 1
