@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from airl_mav.arena.geometry import Arena, Bounds, Obstacles, PlacedMesh, Shape
+from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape
 from airl_mav.camera.equidistant import fisheye_places, fisheye_rays
-from airl_mav.camera.fisheye import check_meshes
 from airl_mav.camera.frame import depth_to_z16
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.picture import render_picture
@@ -27,7 +26,6 @@ from airl_mav.policy.scans import rays_of
 from airl_mav.prediction.reprojection import CameraPose, Reprojector, Sight
 from airl_mav.profiles.appearance import DEFAULT
 from airl_mav.profiles.distortion import UNDISTORTED, Distortion
-from airl_mav.profiles.mesh_file import MeshFile
 from airl_mav.profiles.vehicle import load_vehicle
 from tests.support.lenses import BARREL, OPENING, published, rays_of_fisheye
 from tests.unit.test_colour import arena, busy, poses, sun
@@ -172,10 +170,6 @@ def test_the_card_tells_a_fisheye_from_a_cylinder_of_the_same_size() -> None:
 
 
 def test_what_it_does_not_see_is_refused() -> None:
-    scene = ball(0.0, 0.0, 5.0, 1.0)
-    mesh = PlacedMesh(MeshFile(file="x", sha256="0" * 64), (0.0, 0.0), 0.0, 1.0, 0, 1)
-    with pytest.raises(UsageError, match="a fisheye sees no meshes; accepted: a pinhole"):
-        check_meshes(WIDE, replace(scene, meshes=(mesh,)))
     with pytest.raises(FieldError, match="value <= 190 deg with 'fisheye'"):
         type(load_vehicle("quad").camera).model_validate(
             {
