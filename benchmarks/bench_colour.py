@@ -20,6 +20,7 @@ from airl_mav.camera.bvh import Meshes
 from airl_mav.camera.colour import Work, render_colour
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.picture import ColourArrays
+from airl_mav.camera.projection import Bent
 from airl_mav.camera.textures import atlas
 from airl_mav.core.kernels import kernel
 
@@ -51,13 +52,14 @@ def colour_all(
     albedo: NDArray[np.float32],
     lights: NDArray[np.float32],
     patterns: NDArray[np.float32],
+    bent: Bent | None,
 ) -> None:
     for i in range(len(position)):
         p, q = position[i], attitude[i]
         render_colour(
             rgb, depth, seen, work, (p[0], p[1], p[2]), (q[0], q[1], q[2], q[3]), focal, cx, cy,
             False, bounds, shape, center, half, yaw, meshes, texture, per_m, offset, albedo, lights,
-            patterns, None,
+            patterns, bent,
         )  # fmt: skip
 
 
@@ -74,9 +76,9 @@ def rates(arena: Arena, k: Intrinsics, poses: tuple[np.ndarray, np.ndarray]) -> 
     times: tuple[list[float], list[float]] = ([], [])
     for _ in range(ROUNDS):
         start = time.perf_counter()
-        render_all(depth, *bodies)
+        render_all(depth, *bodies, None)
         middle = time.perf_counter()
-        colour_all(rgb, depth, seen, work, *coloured)
+        colour_all(rgb, depth, seen, work, *coloured, None)
         times[0].append(middle - start)
         times[1].append(time.perf_counter() - middle)
     return POSES / min(times[0]), POSES / min(times[1])

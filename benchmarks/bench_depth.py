@@ -21,6 +21,7 @@ from rich.table import Table
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape
 from airl_mav.camera.bvh import Meshes
 from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.projection import Bent
 from airl_mav.camera.raycast import render_depth
 from airl_mav.camera.render import render
 from airl_mav.core.frames import (
@@ -73,6 +74,7 @@ def render_all(
     half: NDArray[np.float64],
     yaw: NDArray[np.float64],
     meshes: Meshes | None,
+    bent: Bent | None,
 ) -> None:
     for i in range(len(position)):
         p, q = position[i], attitude[i]
@@ -91,7 +93,7 @@ def render_all(
             half,
             yaw,
             meshes,
-            None,
+            bent,
         )
 
 
@@ -111,7 +113,7 @@ def in_compiled_loop(arena: Arena, k: Intrinsics, poses: tuple[np.ndarray, np.nd
 
     def work() -> int:
         render_all(out, *poses, k.focal, k.cx, k.cy, arena.bounds.as_array(),
-                   o.shape, o.center, o.half_size, o.yaw, None)  # fmt: skip
+                   o.shape, o.center, o.half_size, o.yaw, None, None)  # fmt: skip
         return POSES
 
     return rate(work)

@@ -5,10 +5,11 @@ ten things: boxes, pillars and spheres, or in their places meshes, bent rings th
 floor. Depth and colour of all scenes are measured in turns, in one process, so that their ratios
 hold on a busy machine, too. The kernels are called from a compiled loop, as in training.
 
-Then 1,000 views of the meshes are compared with rays that trimesh casts: by Embree where `embreex`
-is installed, else by its own caster, which needs `rtree` and takes hours; `--views` asks for fewer.
-All pixels are compared, those on edges as well, and how many differ is told. Embree's rays are of
-32 bits: where they pass an edge by less than that, it may see another triangle.
+Both are measured with a pinhole and with a fisheye, and then 1,000 views of the meshes are compared
+with rays that trimesh casts: by Embree where `embreex` is installed, else by its own caster, which
+needs `rtree` and takes hours; `--views` asks for fewer. All pixels are compared, those on edges as
+well, and how many differ is told. Embree's rays are of 32 bits: where they pass an edge by less
+than that, it may see another triangle.
 """
 
 from __future__ import annotations
@@ -34,8 +35,10 @@ from airl_mav.arena.geometry import Arena, PlacedMesh
 from airl_mav.arena.triangles import Triangles, encoded, triangles_of
 from airl_mav.camera.bvh import meshes_of
 from airl_mav.camera.colour import Work
+from airl_mav.camera.fisheye import bent_of
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.picture import ColourArrays
+from airl_mav.camera.rays import rays_of
 from airl_mav.camera.render import render
 from airl_mav.camera.textures import atlas
 from airl_mav.core.frames import quat_to_matrix
@@ -43,6 +46,10 @@ from airl_mav.profiles.mesh_file import MeshFile
 
 THINGS = 10
 ROUNDS = 15
+FISHEYE_FOV = math.radians(170.0)
+DISTORTION = (-0.05, 0.008, -0.0045, 0.0004)
+"""Of the fisheye that looks at the same scenes."""
+
 RINGS = {2_000: (50, 20), 20_000: (200, 50)}
 """Sections around and across a ring, by its number of triangles."""
 
@@ -89,13 +96,14 @@ def rates(
         surfaces: tuple[Any, ...] = (look.texture, look.per_m, look.offset, look.albedo)
         surfaces += (look.lights, atlas())
         calls.append((bodies, surfaces))
+    last: tuple[Any, ...] = (bent_of(k),)
     best = np.full((len(arenas), 2), math.inf)
     for _ in range(ROUNDS + 1):  # the first one compiles
         for each, (bodies, surfaces) in enumerate(calls):
             start = time.perf_counter()
-            render_all(depth, *bodies)
+            render_all(depth, *bodies, *last)
             middle = time.perf_counter()
-            colour_all(rgb, depth, seen, work, *bodies, *surfaces)
+            colour_all(rgb, depth, seen, work, *bodies, *surfaces, *last)
             took = middle - start, time.perf_counter() - middle
             best[each] = np.minimum(best[each], took)
     return [(POSES / d, POSES / c) for d, c in best.tolist()]
@@ -119,21 +127,22 @@ def traced(
     mesh: trimesh.Trimesh, k: Intrinsics, position: np.ndarray, attitude: np.ndarray
 ) -> NDArray[np.float64]:
     """Return the depth image of a mesh by trimesh's rays [m]; infinity: it is not hit."""
-    v, u = np.mgrid[: k.height, : k.width].reshape(2, -1)
-    local = np.stack([np.ones(len(u)), (u - k.cx) / k.focal, (v - k.cy) / k.focal], axis=1)
-    forward = quat_to_matrix(attitude)[:, 0]
-    rays = local @ quat_to_matrix(attitude).T
+    rays = rays_of(k).reshape(3, -1).T @ quat_to_matrix(attitude).T
+    sees = np.flatnonzero(rays.any(axis=1))
     places, which, _ = mesh.ray.intersects_location(
-        np.broadcast_to(position, rays.shape), rays, multiple_hits=False
+        np.broadcast_to(position, rays[sees].shape), rays[sees], multiple_hits=False
     )
-    depth = np.full(len(rays), math.inf)
-    np.minimum.at(depth, which, (places - position) @ forward)
+    depth, hit = np.full(len(rays), math.inf), rays[sees[which]]
+    along = ((places - position) * hit).sum(axis=1) / (hit * hit).sum(axis=1)
+    np.minimum.at(depth, sees[which], along)
     return depth.reshape(k.height, k.width)
 
 
-def compare(arena: Arena, views: int, rng: np.random.Generator, console: Console) -> None:
+def compare(
+    arena: Arena, k: Intrinsics, views: int, rng: np.random.Generator, console: Console
+) -> None:
     """Tell how far depth images of an arena's meshes are from trimesh's rays."""
-    k, mesh = Intrinsics.from_fov(64, 48, FOV), in_world(arena)
+    mesh = in_world(arena)
     bare = replace(arena, meshes=(), obstacles=make_arena(0, rng).obstacles)
     apart: list[NDArray[np.float64]] = []
     position, attitude = make_poses(rng)
@@ -152,9 +161,9 @@ def compare(arena: Arena, views: int, rng: np.random.Generator, console: Console
     edges = int(np.count_nonzero(all_apart > 1e-4))
     caster = "Embree" if trimesh.ray.has_embree else "trimesh's own caster"
     console.print(
-        f"Depth of meshes beside {caster}: {views:,} views, {len(all_apart):,} pixels that see a"
-        f" mesh; {edges} of them (on edges) are more than 0.1 mm apart, all others at most"
-        f" {all_apart[all_apart <= 1e-4].max():.2g} m",
+        f"Depth of meshes, {k.projection}, beside {caster}: {views:,} views, {len(all_apart):,}"
+        f" pixels that see a mesh; {edges} of them (on edges) are more than 0.1 mm apart, all"
+        f" others at most {all_apart[all_apart <= 1e-4].max():.2g} m",
         highlight=False,
     )
 
@@ -173,18 +182,23 @@ def main() -> None:
             "a mesh of 20,000 triangles": with_meshes(make_arena(1, rng), fine[1]),
             f"{THINGS} meshes of 20,000 triangles": with_meshes(plain, fine[1]),
         }
-        table = Table(title="Images of 64x48 a second, one core")
-        table.add_column("scene")
-        for heading in ("depth", "colour", "us an image"):
-            table.add_column(heading, justify="right")
-        k = Intrinsics.from_fov(64, 48, FOV)
-        for name, (depth, colour) in zip(
-            scenes, rates(list(scenes.values()), k, poses), strict=True
-        ):
-            table.add_row(name, f"{depth:,.0f}", f"{colour:,.0f}", f"{1e6 / colour:.0f}")
-        console.print(table)
+        cameras = (
+            Intrinsics.from_fov(64, 48, FOV),
+            Intrinsics.from_fov(64, 48, FISHEYE_FOV, "fisheye", distortion=DISTORTION),
+        )
+        for k in cameras:
+            table = Table(title=f"Images of 64x48 a second, one core, {k.projection}")
+            table.add_column("scene")
+            for heading in ("depth", "colour", "us an image"):
+                table.add_column(heading, justify="right")
+            told = rates(list(scenes.values()), k, poses)
+            for name, (depth, colour) in zip(scenes, told, strict=True):
+                table.add_row(name, f"{depth:,.0f}", f"{colour:,.0f}", f"{1e6 / colour:.0f}")
+            console.print(table)
         if options.views:
-            compare(scenes[f"{THINGS} meshes of 2,000 triangles"], options.views, rng, console)
+            seen = scenes[f"{THINGS} meshes of 2,000 triangles"]
+            for k in cameras:
+                compare(seen, k, options.views, rng, console)
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ from airl_mav.camera.frame import Frame
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.goals import Goal, goal_height_m
 from airl_mav.policy.observation import Kinematics
+from airl_mav.profiles.distortion import sees_to, undistorted
 from airl_mav.scenario.model import LimitSettings, PilotSettings
 from companion.camera import ReceivedFrame
 from companion.interfaces import FRAMES_LATE, TELEMETRY_FROZEN, VehicleStatus
@@ -360,8 +361,13 @@ def ground_in_view(frame: Frame, state: Kinematics, mount_pitch_up_rad: float) -
     cylinder's rows lie as a pinhole's do.
     """
     lens = frame.intrinsics
+    below_rad = math.atan2(lens.height - 1 - lens.cy, lens.focal)
+    if lens.projection == "fisheye":
+        edge = np.array(max(lens.height - 1 - lens.cy, 0.0) / lens.focal)
+        # Infinite where the image is higher than the lens's circle: that row sees nothing.
+        below_rad = min(float(undistorted(edge, lens.distortion)), sees_to(lens.distortion))
     w, x, y, z = state.quaternion
     pitch_rad = math.asin(min(1.0, max(-1.0, 2.0 * (w * y - z * x))))
-    down_rad = math.atan2(lens.height - 1 - lens.cy, lens.focal) - pitch_rad - mount_pitch_up_rad
+    down_rad = below_rad - pitch_rad - mount_pitch_up_rad
     height_m = -float(state.position[2])
     return down_rad > GRAZING_RAD and 0.0 < height_m < GROUND_M * math.sin(down_rad)

@@ -199,6 +199,7 @@ LENSES = (
     Intrinsics.from_fov(16, 12, math.pi / 2, kind="rgb"),
     Intrinsics.from_fov(16, 12, 2.0 * math.pi, "cylindrical", "grey"),
     Intrinsics.from_fov(16, 12, math.pi, "fisheye"),
+    Intrinsics.from_fov(16, 12, 2.0, "fisheye", "rgb", (-0.05, 0.008, -0.0045, 0.0004)),
 )
 STAMPS = (0, 1, -1, 2**63 - 1, -(2**63), US_PER_S, 10**15)
 NUMBERS = (0.0, -1.0, 1e-320, 1e308, math.nan, math.inf, -math.inf, 8.0)

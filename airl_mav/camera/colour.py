@@ -173,7 +173,7 @@ def render_colour(
             )  # fmt: skip
     if meshes is not None and faces is not None and sunny:
         shade_by_meshes(
-            lit, far, ids, faces, work.corners, lines, xs, view, axes, camera, meshes, to_sun
+            lit, far, ids, faces, work.corners, lines, xs, bent, view, axes, camera, meshes, to_sun
         )
     draw_sky(out, all_ids, points, rays, camera, light)
     pixel2 = F32(1.0 / (focal * focal))
@@ -188,7 +188,7 @@ def render_colour(
     if meshes is not None and faces is not None:
         shade_meshes(
             out, all_ids, all_far, all_lit, all_clear, points, rectangles, meshes, faces.ravel(),
-            lines, xs, axes, camera, texture, per_m, offset, albedo, light, atlas, pixel2,
+            lines, xs, bent, axes, camera, texture, per_m, offset, albedo, light, atlas, pixel2,
         )  # fmt: skip
     for i in range(len(shape)):
         if is_owned(meshes, i):

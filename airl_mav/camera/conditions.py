@@ -50,8 +50,6 @@ def check_renderer(camera: Camera, renderer: Renderer, arena: ArenaSpec) -> None
         accepted = "raycast with a depth camera; mitsuba draws colour"
     elif camera.imaging is not None:
         accepted = "raycast with a camera that has a table imaging"
-    elif camera.projection != "pinhole":
-        accepted = f"raycast with a {camera.projection} camera"
     elif arena.appearance.fog.drawn:
         accepted = "raycast in an arena with fog"
     elif find_spec("mitsuba") is None:

@@ -1,23 +1,20 @@
-"""The equidistant fisheye, r = f theta: equal angles are equal ways in the image.
+"""Where a fisheye's pixels look, and where directions fall on it: r = f theta_d.
 
-That of Kannala and Brandt ("A generic camera model and calibration method for conventional, wide-
-angle, and fish-eye lenses", 2006) and of OpenCV's `fisheye` with all coefficients 0. Depth is
-measured along the ray: along the optical axis it would be 0 at 90 degrees, and negative beyond.
+theta_d is the angle from the optical axis, as `profiles.distortion` distorts it: equal angles are
+equal ways in the image of a lens without coefficients. Depth is measured along the ray: along the
+optical axis it would be 0 at 90 degrees, and negative beyond.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.profiles.projection import FISHEYE_MOST_DEG
-
-MOST_OFF_RAD: Final = math.radians(0.5 * FISHEYE_MOST_DEG)
-"""What is farther from the optical axis falls on no pixel [rad]."""
+from airl_mav.profiles.distortion import distorted, sees_to, undistorted
 
 
 def fisheye_rays(camera: Intrinsics) -> NDArray[np.float64]:
@@ -27,11 +24,14 @@ def fisheye_rays(camera: Intrinsics) -> NDArray[np.float64]:
     """
     across = (np.arange(camera.width) - camera.cx) / camera.focal
     down = ((np.arange(camera.height) - camera.cy) / camera.focal)[:, None]
-    off = np.hypot(across, down)
-    # sin(off) / off, which is 1 in the middle.
-    share = np.sinc(off / math.pi)
+    out = np.hypot(across, down)
+    off = undistorted(out, camera.distortion)
+    outside = np.isinf(off)
+    off[outside] = 0.0
+    # sin(off) / out, which is 1 in the middle.
+    share = np.sinc(off / math.pi) * np.divide(off, out, out=np.ones_like(out), where=out > 0.0)
     rays = np.stack([np.cos(off), across * share, down * share])
-    rays[:, off > MOST_OFF_RAD + 1e-9] = 0.0
+    rays[:, outside] = 0.0
     return rays
 
 
@@ -42,7 +42,7 @@ def fisheye_places(camera: Intrinsics, points: NDArray[Any]) -> tuple[NDArray[An
     """
     aside = np.hypot(points[1], points[2])
     off = np.arctan2(aside, points[0])
-    scale = camera.focal * off / np.maximum(aside, 1e-9)
-    scale = np.where(off > MOST_OFF_RAD, np.inf, scale)
+    scale = camera.focal * distorted(off, camera.distortion) / np.maximum(aside, 1e-9)
+    scale = np.where(off > sees_to(camera.distortion), np.inf, scale)
     with np.errstate(invalid="ignore"):
         return points[1] * scale + camera.cx, points[2] * scale + camera.cy

@@ -6,11 +6,10 @@ from functools import lru_cache
 
 import numpy as np
 
-from airl_mav.arena.geometry import Arena
 from airl_mav.camera.equidistant import fisheye_rays
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.projection import Bent
-from airl_mav.core.errors import UsageError
+from airl_mav.profiles.distortion import sees_to
 
 
 def bent_of(camera: Intrinsics) -> Bent | None:
@@ -21,13 +20,6 @@ def bent_of(camera: Intrinsics) -> Bent | None:
 @lru_cache(maxsize=64)
 def _bent_of(camera: Intrinsics) -> Bent:
     forward, right, down = np.ascontiguousarray(fisheye_rays(camera))
-    return Bent(forward, down, right)
-
-
-def check_meshes(camera: Intrinsics, arena: Arena) -> None:
-    """Raise UsageError where a fisheye looks at an arena with meshes."""
-    if camera.projection == "fisheye" and arena.meshes:
-        raise UsageError(
-            f"arena {arena.name}: a fisheye sees no meshes; accepted: a pinhole or a cylinder, or"
-            " an arena without meshes"
-        )
+    # Numbers of one type, so that there is one compiled kernel.
+    k1, k2, k3, k4 = (float(each) for each in camera.distortion)
+    return Bent(forward, down, right, (k1, k2, k3, k4), sees_to(camera.distortion))

@@ -14,13 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena
-from airl_mav.camera.equidistant import fisheye_rays
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.picture import Picture
 from airl_mav.camera.primitives import OBSTACLE
+from airl_mav.camera.rays import rays_of
 from airl_mav.camera.render import Motion, Mount, camera_pose
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import quat_to_matrix
+from airl_mav.profiles.distortion import distorted, steepness
 
 Floats = NDArray[np.float64]
 
@@ -93,20 +94,6 @@ def optical_flow(
     return flow.astype(np.float32)
 
 
-def rays_of(camera: Intrinsics) -> Floats:
-    """Return the rays (3, h, w) of a camera's pixels at a depth of 1: forward, right, down."""
-    if camera.projection == "fisheye":
-        return fisheye_rays(camera)
-    rays = np.ones((3, camera.height, camera.width))
-    across = (np.arange(camera.width) - camera.cx) / camera.focal
-    if camera.cylindrical:
-        rays[0], rays[1] = np.cos(across), np.sin(across)
-    else:
-        rays[1] = across
-    rays[2] = ((np.arange(camera.height) - camera.cy) / camera.focal)[:, None]
-    return rays
-
-
 def _pushed(camera: Intrinsics, points: Floats, moves: Floats) -> tuple[Any, Any]:
     """Return how fast points (3, h, w), which move so (3, h, w), move over the image [px/s]."""
     (z, x, y), (dz, dx, dy), f = points, moves, camera.focal
@@ -121,8 +108,9 @@ def _pushed(camera: Intrinsics, points: Floats, moves: Floats) -> tuple[Any, Any
         aside = np.hypot(x, y)
         off = np.arctan2(aside, z)
         growing = (x * dx + y * dy) / aside
-        # Columns and rows are f c x and f c y, with c = off / aside, which is 1 / z on the axis.
-        share = np.where(aside > _ON_AXIS, off / aside, 1.0 / z)
+        # Columns and rows are f c x and f c y, with c = theta_d / aside: 1 / z on the axis.
+        share = np.where(aside > _ON_AXIS, distorted(off, camera.distortion) / aside, 1.0 / z)
         opening = (z * growing - aside * dz) / (aside * aside + z * z)
+        opening = steepness(off, camera.distortion) * opening
         changing = np.where(aside > _ON_AXIS, (opening - share * growing) / aside, -dz / (z * z))
         return f * (changing * x + share * dx), f * (changing * y + share * dy)

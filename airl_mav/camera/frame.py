@@ -14,6 +14,7 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.jpeg import image_of
 from airl_mav.core.errors import UsageError
 from airl_mav.profiles.camera_kind import CameraKind, shape_of
+from airl_mav.profiles.distortion import MOST_COEFFICIENT, UNDISTORTED, Distortion
 from airl_mav.profiles.projection import Projection
 
 MAGICS: dict[tuple[CameraKind, Projection], bytes] = {
@@ -40,6 +41,16 @@ JPEG_MAGICS: dict[tuple[CameraKind, Projection], bytes] = {
 }
 """The same where a JPEG file follows the header in place of pixels."""
 
+_DISTORTED: dict[bytes, bytes] = {
+    b"ADE1": b"ADK1",
+    b"ARE1": b"ARK1",
+    b"AGE1": b"AGK1",
+    b"JRE1": b"JRK1",
+    b"JGE1": b"JGK1",
+}
+"""How those of a fisheye begin where its four coefficients follow the header, before the pixels:
+Kannala and Brandt's lens."""
+
 _CAMERA_OF = {magic: camera for camera, magic in MAGICS.items()}
 _JPEG_CAMERA_OF = {magic: camera for camera, magic in JPEG_MAGICS.items()}
 
@@ -50,11 +61,16 @@ _PIXELS: dict[CameraKind, tuple[str, int]] = {
 }
 """Type of the numbers on the wire, and bytes of a pixel."""
 
+_UNDISTORTED_AS = {magic: plain for plain, magic in _DISTORTED.items()}
+
 # magic, sequence, capture time [µs], width, height, focal, cx, cy; little endian
 _HEADER = struct.Struct("<4sQqHHddd")
 
+# k1, k2, k3, k4; little endian
+_COEFFICIENTS = struct.Struct("<4d")
+
 MOST_PIXELS = 4096 * 4096
-MOST_BYTES = _HEADER.size + 3 * MOST_PIXELS
+MOST_BYTES = _HEADER.size + _COEFFICIENTS.size + 3 * MOST_PIXELS
 """Size of the largest frame, 50 MB: whoever receives them need not take in more."""
 
 MM_PER_M = 1000.0
@@ -100,11 +116,15 @@ class Frame:
     def to_bytes(self) -> bytes:
         """Return the wire form."""
         k = self.intrinsics
+        magic = (MAGICS if self.jpeg is None else JPEG_MAGICS)[k.kind, k.projection]
+        distorts = k.distortion != UNDISTORTED
         header = _HEADER.pack(
-            (MAGICS if self.jpeg is None else JPEG_MAGICS)[k.kind, k.projection],
+            _DISTORTED[magic] if distorts else magic,
             *(self.sequence, self.capture_time_us),
             *(k.width, k.height, k.focal, k.cx, k.cy),
         )
+        if distorts:
+            header += _COEFFICIENTS.pack(*k.distortion)
         if self.jpeg is not None:
             return header + self.jpeg
         return header + self.image.astype(_PIXELS[k.kind][0], copy=False).tobytes()
@@ -115,20 +135,24 @@ class Frame:
 
         Raises FrameError for anything else, also for what no camera takes: an image without pixels
         or with too many, a focal length or a centre out of bounds, or not a number, a cylinder of
-        more than a turn, a damaged JPEG or one of another size. Raises UsageError for a JPEG where
-        Pillow is not installed.
+        more than a turn, coefficients out of bounds, a damaged JPEG or one of another size. Raises
+        UsageError for a JPEG where Pillow is not installed.
         """
         if len(data) < _HEADER.size:
             raise FrameError(f"{len(data)} bytes are too short for a frame header")
         magic, sequence, time_us, width, height, focal, cx, cy = _HEADER.unpack_from(data)
-        camera = _CAMERA_OF.get(magic) or _JPEG_CAMERA_OF.get(magic)
+        plain = _UNDISTORTED_AS.get(magic, magic)
+        camera = _CAMERA_OF.get(plain) or _JPEG_CAMERA_OF.get(plain)
         if camera is None:
-            known = " or ".join(repr(each) for each in (*_CAMERA_OF, *_JPEG_CAMERA_OF))
+            magics = (*_CAMERA_OF, *_JPEG_CAMERA_OF, *_UNDISTORTED_AS)
+            known = " or ".join(repr(each) for each in magics)
             raise FrameError(f"magic {magic!r}, expected {known}")
         kind, projection = camera
         number, size = _PIXELS[kind]
-        compressed = magic in _JPEG_CAMERA_OF
-        if not compressed and len(data) != _HEADER.size + size * width * height:
+        compressed, distortion, begins = plain in _JPEG_CAMERA_OF, UNDISTORTED, _HEADER.size
+        if plain != magic:
+            distortion, begins = _coefficients(data), _HEADER.size + _COEFFICIENTS.size
+        if not compressed and len(data) != begins + size * width * height:
             raise FrameError(f"{len(data)} bytes do not hold {width}x{height} pixels of {kind}")
         if not 0 < width * height <= MOST_PIXELS:
             raise FrameError(f"{width}x{height} pixels: accepted: 1..{MOST_PIXELS}")
@@ -137,16 +161,27 @@ class Frame:
             raise FrameError(f"focal {focal}, centre {cx}, {cy}: no {projection} camera")
         if projection == "cylindrical" and width > _TURN * 2.0 * math.pi * focal:
             raise FrameError(f"focal {focal}, {width} px wide: a cylinder of more than one turn")
-        lens = Intrinsics(width, height, focal, cx, cy, projection, kind)
+        lens = Intrinsics(width, height, focal, cx, cy, projection, kind, distortion)
         if compressed:
-            jpeg = data[_HEADER.size :]
+            jpeg = data[begins:]
             try:
                 decoded = image_of(jpeg, height, width, size)
             except ValueError as error:
                 raise FrameError(str(error)) from None
             return cls(sequence, time_us, decoded, lens, jpeg)
-        pixels = np.frombuffer(data, number, offset=_HEADER.size)
+        pixels = np.frombuffer(data, number, offset=begins)
         return cls(sequence, time_us, pixels.reshape(shape_of(kind, height, width)), lens)
+
+
+def _coefficients(data: bytes) -> Distortion:
+    """Return the coefficients that follow a header. Raises FrameError."""
+    if len(data) < _HEADER.size + _COEFFICIENTS.size:
+        raise FrameError(f"{len(data)} bytes are too short for the coefficients of a lens")
+    k1, k2, k3, k4 = _COEFFICIENTS.unpack_from(data, _HEADER.size)
+    # Written so that NaN fails.
+    if not all(abs(each) <= MOST_COEFFICIENT for each in (k1, k2, k3, k4)):
+        raise FrameError(f"coefficients {k1}, {k2}, {k3}, {k4}: no fisheye")
+    return k1, k2, k3, k4
 
 
 def depth_only(image: NDArray[Any], intrinsics: Intrinsics) -> NDArray[np.uint16]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from airl_mav.profiles.camera_kind import CameraKind, shape_of
+from airl_mav.profiles.distortion import UNDISTORTED, Distortion, distorted, sees_to, undistorted
 from airl_mav.profiles.projection import Projection
 
 if TYPE_CHECKING:  # A frame source needs no models of profiles.
@@ -29,9 +30,11 @@ class Intrinsics:
       from above. Depth is measured in the camera's horizontal plane, perpendicular to the axis of
       the cylinder. Upright edges are upright in the image, and the column of the optical axis is
       that of a pinhole of the same focal length.
-    - fisheye, equidistant: (sin b cos c, sin b sin c, cos b), at the angle b = r / focal [rad] from
-      the optical axis, where r is the way from (cx, cy) to the pixel and c its direction. Depth is
-      measured along that unit vector. Pixels more than 95 degrees from the axis see nothing.
+    - fisheye: (sin b cos c, sin b sin c, cos b), at the angle b [rad] from the optical axis that
+      `profiles.distortion` makes r / focal of, where r is the way from (cx, cy) to the pixel and c
+      its direction; without coefficients b is r / focal, equidistant. Depth is measured along that
+      unit vector. Pixels more than 95 degrees from the axis see nothing, nor do those beyond the
+      angle to which the coefficients hold.
 
     In all of them depth is the factor of that vector which leads to the point that is seen.
     """
@@ -39,11 +42,14 @@ class Intrinsics:
     width: int
     height: int
     focal: float
-    """Focal length [px] of a pinhole, pixels for an angle [px/rad] of a cylinder and a fisheye."""
+    """Focal length [px] of a pinhole, pixels for an angle [px/rad] of a cylinder and in the middle
+    of a fisheye."""
     cx: float
     cy: float
     projection: Projection = "pinhole"
     kind: CameraKind = "depth"
+    distortion: Distortion = UNDISTORTED
+    """Coefficients of a fisheye."""
 
     @classmethod
     def from_fov(
@@ -53,16 +59,19 @@ class Intrinsics:
         horizontal_fov: float,
         projection: Projection = "pinhole",
         kind: CameraKind = "depth",
+        distortion: Distortion = UNDISTORTED,
     ) -> Intrinsics:
         """Return the intrinsics of a camera with a horizontal field of view [rad].
 
         It is in (0, pi) for a pinhole, in (0, 2 pi] for a cylinder, to 190 degrees for a fisheye.
+        The focal length is the one with which half of it falls on the edge of the image.
         """
         if projection != "pinhole":
-            focal = width / horizontal_fov
+            focal = width / (2.0 * distorted(0.5 * horizontal_fov, distortion))
         else:
             focal = 0.5 * width / math.tan(0.5 * horizontal_fov)
-        return cls(width, height, focal, 0.5 * (width - 1), 0.5 * (height - 1), projection, kind)
+        cx, cy = 0.5 * (width - 1), 0.5 * (height - 1)
+        return cls(width, height, focal, cx, cy, projection, kind, distortion)
 
     @classmethod
     def of(cls, camera: Camera) -> Intrinsics:
@@ -73,6 +82,7 @@ class Intrinsics:
             math.radians(camera.horizontal_fov_deg),
             camera.projection,
             camera.kind,
+            camera.distortion,
         )
 
     @property
@@ -93,6 +103,9 @@ class Intrinsics:
     @property
     def horizontal_fov_rad(self) -> float:
         """Horizontal field of view [rad], from edge to edge of the image."""
+        if self.distortion != UNDISTORTED:
+            half = undistorted(np.array(0.5 * self.width / self.focal), self.distortion)
+            return 2.0 * min(float(half), sees_to(self.distortion))
         if self.projection != "pinhole":
             return self.width / self.focal
         return 2.0 * math.atan2(0.5 * self.width, self.focal)

@@ -15,9 +15,9 @@ from airl_mav.camera.bvh import STACK, Bvh, Meshes
 from airl_mav.camera.mesh_triangles import Faces
 from airl_mav.camera.meshes import inverse_of, seen_from
 from airl_mav.camera.primitives import OBSTACLE, SKY, Ids, Line, Lines
-from airl_mav.camera.projection import Pose, View, dot
+from airl_mav.camera.projection import Bent, Pose, View, dot, ray_of
 from airl_mav.camera.shading import F32, ZERO, Plane
-from airl_mav.camera.shadows import shadow_rectangle, start32, widened
+from airl_mav.camera.shadows import along32, ray32, shadow_rectangle, start32, widened
 from airl_mav.core.kernels import kernel, large_kernel
 from airl_mav.vehicle.rotation import Vec
 
@@ -37,6 +37,7 @@ def shade_by_meshes(
     corners: NDArray[np.float64],
     lines: Lines,
     xs: Line,
+    bent: Bent | None,
     view: View,
     axes: Pose,
     camera: Vec,
@@ -53,6 +54,7 @@ def shade_by_meshes(
         corners: (CORNERS, 3) room to work in.
         lines: Of the image.
         xs: Rays of a line.
+        bent: A fisheye's rays, in place of both; None: it is another image.
         view: How the image sees.
         axes: The camera's axes.
         camera: (3,) NED [m].
@@ -62,8 +64,9 @@ def shade_by_meshes(
     waiting = np.empty(STACK, np.int32)
     for k in range(len(meshes.root)):
         _shade_by_mesh(
-            lit, far, ids, faces, corners, lines, xs, view, axes, camera, meshes, k, to_sun, waiting
-        )
+            lit, far, ids, faces, corners, lines, xs, bent, view, axes, camera, meshes, k, to_sun,
+            waiting,
+        )  # fmt: skip
 
 
 @large_kernel
@@ -75,6 +78,7 @@ def _shade_by_mesh(
     corners: NDArray[np.float64],
     lines: Lines,
     xs: Line,
+    bent: Bent | None,
     view: View,
     axes: Pose,
     camera: Vec,
@@ -94,7 +98,7 @@ def _shade_by_mesh(
     middle = (c[0] + box[0], c[1] + box[1], c[2] + box[2])
     top, bottom, left, end = 0, len(lines), 0, len(xs)
     per = 1.0 / scale
-    if not view.cylindrical:
+    if bent is None and not view.cylindrical:
         # In units of the mesh, as all that follows.
         floor = -(middle[2] + per * camera[2])
         around = Pose(pose.forward, pose.across, pose.along, middle)
@@ -106,11 +110,11 @@ def _shade_by_mesh(
     left, end = widened(left, end, 0, len(xs))
     inverse = (inverse_of(sun[0]), inverse_of(sun[1]), inverse_of(sun[2]))
     own = np.int32(OBSTACLE + meshes.first[k])
-    f, d, r = pose.forward, pose.across, pose.along
+    f, d, along = pose.forward, pose.across, along32(pose)
     above, last = per * _ABOVE_M, -1
     # First which points may be hidden, in float32 and so many at a time.
     c0, c1, c2 = F32(middle[0]), F32(middle[1]), F32(middle[2])
-    r0, r1, r2, per32 = F32(r[0]), F32(r[1]), F32(r[2]), F32(per)
+    per32 = F32(per)
     i0, i1, i2 = F32(inverse[0]), F32(inverse[1]), F32(inverse[2])
     wide = per * _WIDER_M
     w0, w1, w2 = (
@@ -120,14 +124,15 @@ def _shade_by_mesh(
     )
     maybe = np.empty(len(xs), np.bool_)
     for v in range(top, bottom):
-        d0, d1, d2 = start32(pose, lines[v, 0], lines[v, 1])
+        start = start32(pose, lines[v, 0], lines[v, 1])
         far_row, ids_row, lit_row = far[v, left:end], ids[v, left:end], lit[v, left:end]
         x_row = xs[left:end]
         for u in range(end - left):
-            x, t = F32(x_row[u]), per32 * far_row[u]
-            a = (c0 - t * (d0 + x * r0)) * i0
-            b = (c1 - t * (d1 + x * r1)) * i1
-            e = (c2 - t * (d2 + x * r2)) * i2
+            t = per32 * far_row[u]
+            n, m, s = ray32(pose, along, bent, v, left + u, start, F32(x_row[u]))
+            a = (c0 - t * n) * i0
+            b = (c1 - t * m) * i1
+            e = (c2 - t * s) * i2
             enter = max(max(a - w0, b - w1), e - w2)
             leave = min(min(a + w0, b + w1), e + w2)
             reached = (leave >= max(enter, ZERO)) & (ids_row[u] != SKY)
@@ -135,13 +140,10 @@ def _shade_by_mesh(
         for u in range(end - left):
             if not maybe[u]:
                 continue
-            x, t = x_row[u], per * far_row[u]
+            t = per * far_row[u]
             ahead, y = lines[v, 0], lines[v, 1]
-            ray = (
-                ahead * f[0] + y * d[0] + x * r[0],
-                ahead * f[1] + y * d[1] + x * r[1],
-                ahead * f[2] + y * d[2] + x * r[2],
-            )
+            begin = (ahead * f[0] + y * d[0], ahead * f[1] + y * d[1], ahead * f[2] + y * d[2])
+            ray = ray_of(pose, bent, v, left + u, begin, x_row[u])
             # From the mesh's origin.
             at = (t * ray[0] - c[0], t * ray[1] - c[1], t * ray[2] - c[2])
             if ids_row[u] == own:

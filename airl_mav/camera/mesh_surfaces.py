@@ -9,7 +9,7 @@ from airl_mav.arena.appearance import OBSTACLE as OBSTACLE_ROW
 from airl_mav.camera.bvh import Meshes
 from airl_mav.camera.mesh_triangles import Faces
 from airl_mav.camera.primitives import OBSTACLE, Ids, Line, Lines, Rectangles, turned
-from airl_mav.camera.projection import Pose
+from airl_mav.camera.projection import Bent, Pose
 from airl_mav.camera.shading import (
     F32,
     I32,
@@ -24,7 +24,7 @@ from airl_mav.camera.shading import (
     surface_of,
     texel_at,
 )
-from airl_mav.camera.shadows import start32
+from airl_mav.camera.shadows import along32, ray32, start32
 from airl_mav.camera.surfaces import STEEP, span_of, texels2
 from airl_mav.core.kernels import large_kernel
 from airl_mav.vehicle.rotation import Vec
@@ -43,6 +43,7 @@ def shade_meshes(
     faces: Faces,
     lines: Lines,
     xs: Line,
+    bent: Bent | None,
     axes: Pose,
     camera: Vec,
     texture: NDArray[np.int8],
@@ -70,6 +71,7 @@ def shade_meshes(
         faces: (n,) which of its triangles is seen.
         lines: Of the image.
         xs: Rays of a line.
+        bent: A fisheye's rays, in place of both; None: it is another image.
         axes: The camera's axes.
         camera: (3,) NED [m].
         texture: As of `colour.render_colour`, with the next three.
@@ -84,8 +86,8 @@ def shade_meshes(
         i = meshes.first[k]
         surface = surface_of(texture, per_m, offset, albedo, OBSTACLE_ROW + i)
         _shade_mesh(
-            out, ids, far, lit, clear, points, rectangles[i, 0], meshes, k, faces, lines, xs, axes,
-            camera, surface, light, atlas, pixel2,
+            out, ids, far, lit, clear, points, rectangles[i, 0], meshes, k, faces, lines, xs, bent,
+            axes, camera, surface, light, atlas, pixel2,
         )  # fmt: skip
 
 
@@ -103,6 +105,7 @@ def _shade_mesh(
     faces: Faces,
     lines: Lines,
     xs: Line,
+    bent: Bent | None,
     axes: Pose,
     camera: Vec,
     surface: Surface,
@@ -115,7 +118,7 @@ def _shade_mesh(
     offset = (meshes.pose[k, 0] - camera[0], meshes.pose[k, 1] - camera[1], -camera[2])
     pose = turned(Pose(axes.forward, axes.across, axes.along, offset), cos, sin)
     c0, c1, c2 = F32(pose.center[0]), F32(pose.center[1]), F32(pose.center[2])
-    r0, r1, r2 = F32(pose.along[0]), F32(pose.along[1]), F32(pose.along[2])
+    r = along32(pose)
     s0 = F32(cos * light.to_sun[0] + sin * light.to_sun[1])
     s1 = F32(cos * light.to_sun[1] - sin * light.to_sun[0])
     s2 = light.to_sun[2]
@@ -129,15 +132,15 @@ def _shade_mesh(
         left, end = span_of(ids, line, line + len(xs), low, high, own, own)
         if end == 0:
             continue
-        d0, d1, d2 = start32(pose, lines[v, 0], lines[v, 1])
+        start = start32(pose, lines[v, 0], lines[v, 1])
         for at in range(left, end):
             u = at - left
             if ids[at] != own:
                 # It is not painted; its place must only be one of the pattern.
                 points.place[u] = I32(1)
                 continue
-            x, t, i = F32(xs[at - line]), far[at], faces[at]
-            n, e, d = d0 + x * r0, d1 + x * r1, d2 + x * r2
+            t, i = far[at], faces[at]
+            n, e, d = ray32(pose, r, bent, v, at - line, start, F32(xs[at - line]))
             n0, n1, n2 = normals[i, 0], normals[i, 1], normals[i, 2]
             normal = n0 * n + n1 * e + n2 * d
             # The side that is seen faces the camera.

@@ -154,7 +154,10 @@ def draw_triangle(
 def met(
     corners: NDArray[np.float32], i: int, view: View, pose: Pose, start: Vec, x: float
 ) -> float:
-    """Return the inverse depth of a triangle along a ray, as `draw_triangle`; 0: it misses it."""
+    """Return the inverse depth of a triangle along a ray, as `draw_triangle`; 0: it misses it.
+
+    Where the view is no pinhole's it is not kept within the depths of the triangle's corners.
+    """
     c, f, r = pose.center, pose.forward, pose.along
     p0 = (c[0] + corners[i, 0], c[1] + corners[i, 1], c[2] + corners[i, 2])
     p1 = (c[0] + corners[i, 3], c[1] + corners[i, 4], c[2] + corners[i, 5])

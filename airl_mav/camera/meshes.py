@@ -4,7 +4,8 @@ All rays of an image begin in one place, so a node of the tree is tested against
 once: the rays that may hit it are those of the rectangle that its box projects to, cut to that of
 its parent. A node is passed over where no ray goes through its rectangle, as most are of a fine
 mesh seen from afar, or where all of its rays have been stopped nearer. Near nodes come before far
-ones. Where one ray is left, it alone goes on through the tree.
+ones. Where one ray is left, it alone goes on through the tree. Of a fisheye, whose rays are affine
+along no line, each goes through the tree alone from the beginning.
 
 Which pixels a box projects to is `mesh_parts`, what a ray does with a triangle `mesh_triangles`.
 """
@@ -20,7 +21,16 @@ from airl_mav.camera.bvh import STACK, Bvh, Meshes
 from airl_mav.camera.mesh_parts import part_of
 from airl_mav.camera.mesh_triangles import Faces, draw_triangle, met
 from airl_mav.camera.primitives import OBSTACLE, Ids, Line, Lines, Rectangles, turned
-from airl_mav.camera.projection import Image, Pose, Rectangle, View
+from airl_mav.camera.projection import (
+    Bent,
+    Image,
+    Pose,
+    Rectangle,
+    View,
+    dot,
+    fisheye_rectangle,
+    ray_of,
+)
 from airl_mav.core.kernels import kernel, large_kernel
 from airl_mav.vehicle.rotation import Vec
 
@@ -55,6 +65,7 @@ def draw_meshes(
     drawn_in: Rectangles | None,
     lines: Lines,
     xs: Line,
+    bent: Bent | None,
     view: View,
     axes: Pose,
     camera: Vec,
@@ -70,6 +81,7 @@ def draw_meshes(
             the rectangle that it may be seen in; None as `ids`.
         lines: Of the image, with the next two.
         xs: Rays of a line.
+        bent: A fisheye's rays, in place of both; None: it is another image.
         view: How the image sees.
         axes: The camera's axes.
         camera: (3,) NED [m].
@@ -82,10 +94,16 @@ def draw_meshes(
         kept = None if drawn_in is None else drawn_in[number, 0]
         pose = seen_from(axes, camera, meshes.pose, k)
         scale = meshes.pose[k, 4]
-        _draw_mesh(
-            out, ids, faces, kept, OBSTACLE + number, lines, xs, view, pose, meshes.bvh,
-            meshes.root[k], scale, waiting, nearest,
-        )  # fmt: skip
+        if bent is None:
+            _draw_mesh(
+                out, ids, faces, kept, OBSTACLE + number, lines, xs, view, pose, meshes.bvh,
+                meshes.root[k], scale, waiting, nearest,
+            )  # fmt: skip
+        else:
+            _cast_mesh(
+                out, ids, faces, kept, OBSTACLE + number, bent, view, pose, meshes.bvh,
+                meshes.root[k], scale, waiting,
+            )  # fmt: skip
 
 
 @large_kernel
@@ -130,9 +148,11 @@ def _draw_mesh(
         )
         if (part[1] - part[0]) * (part[3] - part[2]) == 1:
             v, u = part[0], part[2]
+            f, d, ahead, y = pose.forward, pose.across, lines[v, 0], lines[v, 1]
+            start = (ahead * f[0] + y * d[0], ahead * f[1] + y * d[1], ahead * f[2] + y * d[2])
             _cast(
-                out, ids, faces, number, v, u, lines[v, 0], lines[v, 1], xs[u], own, pose, bvh,
-                node, per, waiting, tops,
+                out, ids, faces, number, v, u, start, xs[u], own, pose, bvh, node, per, waiting,
+                tops,
             )  # fmt: skip
             continue
         if _hidden(out, part, per / nearest[tops]):
@@ -157,6 +177,43 @@ def _draw_mesh(
         if part_r[0] < part_r[1] and part_r[2] < part_r[3]:
             _wait(waiting, nearest, tops, right, near_r, part_r)
             tops += 1
+
+
+@large_kernel
+def _cast_mesh(
+    out: Image,
+    ids: Ids | None,
+    faces: Faces | None,
+    drawn_in: Rectangles | None,
+    number: int,
+    bent: Bent,
+    view: View,
+    pose: Pose,
+    bvh: Bvh,
+    root: int,
+    scale: float,
+    waiting: NDArray[np.int32],
+) -> None:
+    """Draw one mesh with the rays of a fisheye, one by one; the rest as of `_draw_mesh`."""
+    # Ranges, as a cylinder's depths, are no depths along the optical axis: `met` is told by this.
+    own = View(view.focal, view.line_centre, view.pixel_centre, view.s_min * scale, True)
+    per = 1.0 / scale
+    box, c = bvh.boxes[root], pose.center
+    half = (float(box[3]), float(box[4]), float(box[5]))
+    middle = (c[0] + box[0], c[1] + box[1], c[2] + box[2])
+    at = Pose(pose.forward, pose.across, pose.along, middle)
+    part = fisheye_rectangle(out, own, bent, at, half, False)
+    if drawn_in is not None:
+        for side in range(4):
+            drawn_in[side] = part[side]
+    nowhere = (0.0, 0.0, 0.0)
+    for v in range(part[0], part[1]):
+        for u in range(part[2], part[3]):
+            ray = ray_of(pose, bent, v, u, nowhere, 0.0)
+            if dot(ray, ray) == 0.0:
+                # A pixel beyond the lens's circle.
+                continue
+            _cast(out, ids, faces, number, v, u, ray, 0.0, own, pose, bvh, root, per, waiting, 0)
 
 
 @kernel
@@ -195,8 +252,7 @@ def _cast(
     number: int,
     v: int,
     u: int,
-    ahead: float,
-    y: float,
+    start: Vec,
     x: float,
     view: View,
     pose: Pose,
@@ -206,9 +262,11 @@ def _cast(
     waiting: NDArray[np.int32],
     tops: int,
 ) -> None:
-    """Draw what one ray hits of a node; those that wait are in front of `waiting[tops]`."""
-    c, f, r, d = pose.center, pose.forward, pose.along, pose.across
-    start = (ahead * f[0] + y * d[0], ahead * f[1] + y * d[1], ahead * f[2] + y * d[2])
+    """Draw what one ray, that of its line and x along it, hits of a node.
+
+    Those that wait are in front of `waiting[tops]`.
+    """
+    c, r = pose.center, pose.along
     ray = (start[0] + x * r[0], start[1] + x * r[1], start[2] + x * r[2])
     i0, i1, i2 = inverse_of(ray[0]), inverse_of(ray[1]), inverse_of(ray[2])
     v0, v1, v2 = abs(i0), abs(i1), abs(i2)

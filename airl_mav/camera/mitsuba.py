@@ -1,14 +1,16 @@
 """An arena and a camera as a scene of Mitsuba 3: path tracing, the reference of `colour`.
 
 Light goes as far as it does: shadows of the sky in corners, colour that one surface throws onto
-another. None of this is in the fast images, but for the means below a ceiling. Fog and cylindrical
-cameras are not here.
+another. None of this is in the fast images, but for the means below a ceiling. Fog is not here.
+
+Its cameras are pinholes: images of cylinders and fisheyes are resampled from those of the faces of
+a cube (`cube_faces`), while they are still light.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +19,7 @@ from airl_mav.arena.appearance import FLOOR, OBSTACLE, TEXTURES, WALLS, Finish, 
 from airl_mav.arena.geometry import Arena, PlacedMesh, Shape
 from airl_mav.arena.triangles import standing, triangles_of
 from airl_mav.camera.colour import RANGE_M
+from airl_mav.camera.cube_faces import FACES, Cube, cube_of, resampled, side_for
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.textures import mean_of, periods, texels
 from airl_mav.core.errors import UsageError
@@ -30,6 +33,9 @@ VARIANT = "scalar_rgb"
 MOST_BOUNCES = 8
 
 _SKY_ROWS = 256
+
+_SEEDS = 1 << 32
+"""Numbers of seeds that Mitsuba tells from each other."""
 
 
 def path_traced(
@@ -47,14 +53,15 @@ def path_traced(
     Args:
         arena: What is seen.
         centers: (n, 3) present obstacle centres NED [m].
-        intrinsics: The camera, a pinhole.
+        intrinsics: The camera.
         position: (3,) camera NED [m].
         quaternion: (4,) unit [w, x, y, z] camera -> NED.
-        samples: Paths a pixel.
+        samples: Paths a pixel; of a cylinder and a fisheye in the middle of the image, elsewhere
+            between two thirds and several times as many.
         seed: Of the paths.
 
     Raises:
-        UsageError: The arena has fog, or the camera is a cylinder.
+        UsageError: The arena has fog.
         ImportError: Mitsuba is not installed: the extra `render`.
     """
     return PathTracer(samples)(arena, centers, intrinsics, position, quaternion, seed)
@@ -69,6 +76,7 @@ class PathTracer:
         self._arena: Arena | None = None
         self._centers: Floats = np.zeros((0, 3))
         self._scene: Any = None
+        self._cube: tuple[Intrinsics, Cube] | None = None
 
     def __call__(
         self,
@@ -80,10 +88,6 @@ class PathTracer:
         seed: int,
     ) -> NDArray[np.uint8]:
         """Return the image; see `path_traced`."""
-        if intrinsics.projection != "pinhole":
-            raise UsageError(
-                f"renderer mitsuba: accepted: a pinhole camera, not a {intrinsics.projection} one"
-            )
         if arena.look.light.extinction > 0.0:
             raise UsageError("renderer mitsuba: accepted: an arena without appearance.fog")
         import mitsuba as mi
@@ -94,30 +98,74 @@ class PathTracer:
             integrator = {"type": "path", "max_depth": MOST_BOUNCES}
             bodies = _lights(mi, arena.look.light) | _bodies(mi, arena, centers)
             self._scene = mi.load_dict({"type": "scene", "integrator": integrator, **bodies})
-        sensor = mi.load_dict(_sensor(mi, intrinsics, position, quaternion, self._samples))
-        rendered = np.array(mi.render(self._scene, sensor=sensor, seed=seed))
-        encoded: NDArray[np.uint8] = np.rint(255.0 * srgb_of(rendered[..., :3])).astype(np.uint8)
+        axes, k = quat_to_matrix(quaternion).T, intrinsics
+        if k.projection == "pinhole":
+            whole = _Film(k.width, k.height, 0, 0, k.width, k.height, k.horizontal_fov_rad)
+            light = self._rendered(mi, axes, position, whole, self._samples, seed)
+        else:
+            light = self._resampled(mi, k, axes, position, seed)
+        encoded: NDArray[np.uint8] = np.rint(255.0 * srgb_of(light)).astype(np.uint8)
         return encoded
 
+    def _rendered(
+        self, mi: Any, axes: Floats, position: Floats, film: _Film, samples: int, seed: int
+    ) -> Floats:
+        """Return the light (h, w, 3) that a pinhole sees; axes (3, 3) forward, right, down."""
+        sensor = mi.load_dict(_sensor(mi, axes, position, film, samples))
+        return np.array(mi.render(self._scene, sensor=sensor, seed=seed))[..., :3]
 
-def _sensor(
-    mi: Any, k: Intrinsics, position: Floats, quaternion: Floats, samples: int
-) -> dict[str, Any]:
-    forward, right, down = quat_to_matrix(quaternion).T
+    def _resampled(
+        self, mi: Any, k: Intrinsics, axes: Floats, position: Floats, seed: int
+    ) -> Floats:
+        """Return the light (h, w, 3) that a cylinder or a fisheye sees."""
+        side = side_for(k, self._samples)
+        if self._cube is None or self._cube[0] != k:
+            self._cube = k, cube_of(k, side)
+        cube = self._cube[1]
+        samples = math.ceil(self._samples / (side * side))
+        images = []
+        for number, face in enumerate(cube.faces):
+            cut = (face.left, face.top, face.width, face.height)
+            film = _Film(face.pixels, face.pixels, *cut, 0.5 * math.pi)
+            # Each face of each image has a seed of its own.
+            own = (seed * len(FACES) + number) % _SEEDS
+            images.append(self._rendered(mi, face.axes @ axes, position, film, samples, own))
+        return resampled(cube, images)
+
+
+class _Film(NamedTuple):
+    """The image of a pinhole, and which part of it is drawn [px]."""
+
+    width: int
+    height: int
+    left: int
+    top: int
+    drawn_width: int
+    drawn_height: int
+    fov: float
+    """Horizontal field of view of the whole image [rad]."""
+
+
+def _sensor(mi: Any, axes: Floats, position: Floats, film: _Film, samples: int) -> dict[str, Any]:
+    forward, right, down = axes
     # Its camera looks along +z; x points to the left of the image, y up.
     pose = np.eye(4)
     pose[:3, :4] = np.column_stack([-right, -down, forward, position])
     return {
         "type": "perspective",
         "fov_axis": "x",
-        "fov": math.degrees(k.horizontal_fov_rad),
+        "fov": math.degrees(film.fov),
         "near_clip": 0.001,
         "far_clip": 2.0 * RANGE_M,
         "to_world": mi.ScalarTransform4f(pose),
         "film": {
             "type": "hdrfilm",
-            "width": k.width,
-            "height": k.height,
+            "width": film.width,
+            "height": film.height,
+            "crop_offset_x": film.left,
+            "crop_offset_y": film.top,
+            "crop_width": film.drawn_width,
+            "crop_height": film.drawn_height,
             "rfilter": {"type": "box"},
             "pixel_format": "rgb",
         },

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -13,8 +13,9 @@ from airl_mav.arena.appearance import Drawn, linear_of, srgb_of
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.bvh import meshes_of
 from airl_mav.camera.colour import Work, render_colour
-from airl_mav.camera.fisheye import bent_of, check_meshes
+from airl_mav.camera.fisheye import bent_of
 from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.rays import finer
 from airl_mav.camera.textures import atlas, mean_of, periods
 from airl_mav.core.kernels import kernel
 from airl_mav.vehicle.rotation import Quat, Vec
@@ -77,9 +78,8 @@ def render_picture(
     Depth has no limit of range. All light is times `gain`, before it becomes numbers.
 
     Raises:
-        UsageError: The file of a mesh cannot be read, or is another one; a fisheye looks at one.
+        UsageError: The file of a mesh cannot be read, or is another one.
     """
-    check_meshes(intrinsics, arena)
     k, obstacles, look = intrinsics, arena.obstacles, ColourArrays.of(arena.look)
     shape = (k.height, k.width)
     # Tuples and arrays of the types that the batch twin hands over: one compiled kernel for both.
@@ -152,15 +152,7 @@ def antialiased(
 
     The sensor has one ray a pixel (`render_picture`, with the other arguments); this is for people.
     """
-    k = intrinsics
-    fine = replace(
-        k,
-        width=side * k.width,
-        height=side * k.height,
-        focal=side * k.focal,
-        cx=side * (k.cx + 0.5) - 0.5,
-        cy=side * (k.cy + 0.5) - 0.5,
-    )
+    k, fine = intrinsics, finer(intrinsics, side)
     codes = render_picture(arena, centers, fine, position, quaternion).rgb
     light = linear_of(np.arange(256) / 255.0)[codes]
     mean = light.reshape(k.height, side, k.width, side, 3).mean(axis=(1, 3))

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.core.kernels import kernel
+from airl_mav.profiles.distortion import Distortion, distorted
 from airl_mav.vehicle.rotation import Vec
 
 MIN_DEPTH_M: Final = 0.001
@@ -60,6 +61,12 @@ class Bent(NamedTuple):
     forward: NDArray[np.float64]  # (n, m)
     across: NDArray[np.float64]  # (n, m)
     along: NDArray[np.float64]  # (n, m)
+    distortion: Distortion
+    sees_to: float
+    """Greatest angle from the optical axis at which it sees anything [rad]."""
+
+
+_distorted = kernel(distorted)
 
 
 @kernel
@@ -197,7 +204,9 @@ def cut(out: Image, view: View, span: Span, turns: int) -> Rectangle:
 
 
 @kernel
-def fisheye_rectangle(out: Image, view: View, pose: Pose, half: Vec, sphere: bool) -> Rectangle:
+def fisheye_rectangle(
+    out: Image, view: View, bent: Bent, pose: Pose, half: Vec, sphere: bool
+) -> Rectangle:
     """Return the pixels of a fisheye that can see a body; empty when none can.
 
     They bound the part of a ring that the sphere around the body falls into: directions as far from
@@ -212,7 +221,7 @@ def fisheye_rectangle(out: Image, view: View, pose: Pose, half: Vec, sphere: boo
     if distance <= radius:
         return 0, out.shape[0], 0, out.shape[1]
     off, spread = math.atan2(aside, z), math.asin(radius / distance)
-    inner, outer = view.focal * (off - spread), view.focal * (off + spread)
+    inner, outer = _way_out(view, bent, off - spread), _way_out(view, bent, off + spread)
     left, right, top, bottom = -outer, outer, -outer, outer
     if off > spread and off + spread < math.pi:
         # Seen from the axis it covers so much to either side of its plane.
@@ -225,6 +234,13 @@ def fisheye_rectangle(out: Image, view: View, pose: Pose, half: Vec, sphere: boo
     u0, u1 = _pixels(u_centre + left, u_centre + right, out.shape[1])
     v0, v1 = _pixels(v_centre + top, v_centre + bottom, out.shape[0])
     return v0, v1, u0, u1
+
+
+@kernel
+def _way_out(view: View, bent: Bent, angle: float) -> float:
+    """Return how far from the middle of a fisheye's image an angle falls [px], within its rim."""
+    rim = bent.sees_to
+    return view.focal * _distorted(min(max(angle, -rim), rim), bent.distortion)
 
 
 @kernel

@@ -86,7 +86,7 @@ def _draw_obstacle(
     span = (0.0, 0.0, 0, 0)
     rectangle = (0, 0, 0, 0)
     if bent is not None:
-        rectangle = fisheye_rectangle(out, view, pose, half, sphere)
+        rectangle = fisheye_rectangle(out, view, bent, pose, half, sphere)
     elif view.cylindrical:
         # What is behind the camera may be at both ends of the image.
         turns = 1
@@ -249,7 +249,7 @@ def draw_bodies(
         ):
             return i
     if meshes is not None:
-        draw_meshes(out, ids, faces, drawn_in, lines, xs, view, axes, camera, meshes)
+        draw_meshes(out, ids, faces, drawn_in, lines, xs, bent, view, axes, camera, meshes)
     return -1
 
 
@@ -297,8 +297,7 @@ def render_depth(
         half_size: (n, 3) as in `Obstacles` [m].
         yaw: (n,) heading of a box's first axis [rad].
         meshes: Those that are seen; None: there are none, and nothing is spent on them.
-        bent: The rays of a fisheye (`fisheye.bent_of`), which sees no meshes; None: it is a pinhole
-            or a cylinder.
+        bent: The rays of a fisheye (`fisheye.bent_of`); None: it is a pinhole or a cylinder.
     """
     camera = (position[0], position[1], min(position[2], -MIN_DEPTH_M))
     height, width = out.shape

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.bvh import meshes_of
-from airl_mav.camera.fisheye import bent_of, check_meshes
+from airl_mav.camera.fisheye import bent_of
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.raycast import render_depth
 from airl_mav.core.kernels import kernel
@@ -101,9 +101,8 @@ def render(
         quaternion: (4,) unit [w, x, y, z] camera -> NED; its x axis is the optical axis.
 
     Raises:
-        UsageError: The file of a mesh cannot be read, or is another one; a fisheye looks at one.
+        UsageError: The file of a mesh cannot be read, or is another one.
     """
-    check_meshes(intrinsics, arena)
     k, obstacles = intrinsics, arena.obstacles
     image = np.empty((k.height, k.width), np.float32)
     render_depth(

@@ -26,7 +26,9 @@ from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.frames import quat_from_euler
 from airl_mav.core.progress import RichProgress
 from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.profiles.camera import Coefficients
 from airl_mav.profiles.camera_kind import Renderer
+from airl_mav.profiles.distortion import UNDISTORTED, check_distortion
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.projection import Projection, check_fov
 from airl_mav.profiles.vehicle import load_vehicle
@@ -72,6 +74,7 @@ OF_A_FLIGHT = ("flight", "rate_hz", "trust")
 
 OF_NO_VEHICLE = (
     *("show", "renderer", "samples", "projection", "width_px", "height_px", "fov_deg", "range_m"),
+    "distortion",
 )
 """Options that the camera of a vehicle profile has no use for: it has its own."""
 
@@ -177,6 +180,9 @@ class RenderOptions(ProfileModel):
     fov_deg: float = quantity(
         "horizontal field of view, less than 170 with a pinhole", "deg", gt=10, le=360, default=90.0
     )
+    distortion: Coefficients = quantity(
+        "coefficients k1 k2 k3 k4 of a fisheye", "1", default=UNDISTORTED
+    )
     range_m: float = quantity(
         "depth at which --show depth is darkest", "m", gt=0.5, le=65, default=20.0
     )
@@ -233,6 +239,7 @@ def _check(options: RenderOptions, filmed: bool) -> None:
             problem = "with --camera" if options.camera else "without --camera or --show flow"
             raise FieldError(name, value, problem=problem)
     check_fov("fov_deg", options.projection, options.fov_deg)
+    check_distortion("distortion", options.projection, options.fov_deg, options.distortion)
     if options.out is not None and options.out.suffix.lower() == VIDEO:
         check_installed("film")
     if options.renderer == "mitsuba":
@@ -256,7 +263,13 @@ def _is_truth(options: RenderOptions, out: Path) -> bool:
 def _camera(options: RenderOptions, size: tuple[int, int]) -> Intrinsics:
     """Return the camera; its size where none is asked for."""
     width, height = options.width_px or size[0], options.height_px or size[1]
-    return Intrinsics.from_fov(width, height, math.radians(options.fov_deg), options.projection)
+    return Intrinsics.from_fov(
+        width,
+        height,
+        math.radians(options.fov_deg),
+        options.projection,
+        distortion=options.distortion,
+    )
 
 
 def _drawn(options: RenderOptions, samples: int) -> Drawn:

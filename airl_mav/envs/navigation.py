@@ -160,6 +160,7 @@ class Navigation(Stateful):
             width_px=spec.image_width_px,
             projection=self.camera.projection,
             horizontal_fov_deg=self.camera.horizontal_fov_deg,
+            distortion=self.camera.distortion,
             range_m=self.camera.range_m,
             kind=self.camera.kind,
             frames=spec.frames,

@@ -17,6 +17,7 @@ from airl_mav.policy.observation_spec import STRIP_ROWS, Frames, GoalHeight, Lay
 from airl_mav.profiles.camera import Camera, check_matched, check_rows
 from airl_mav.profiles.camera_kind import CameraKind
 from airl_mav.profiles.conditions import SensorNoise, Spread, WindSettings
+from airl_mav.profiles.distortion import check_distortion
 from airl_mav.profiles.projection import CYLINDER_MOST_DEG, Projection, check_fov
 from airl_mav.profiles.vehicle import load_vehicle
 
@@ -84,7 +85,9 @@ class CameraChange(ProfileModel):
     def of(self, camera: Camera) -> Camera:
         """Return a vehicle's camera with the changes. Raises FieldError where they do not fit."""
         made = camera.model_copy(update=self.model_dump(exclude_none=True))
-        check_fov("camera.horizontal_fov_deg", made.projection, made.horizontal_fov_deg)
+        fov_deg = made.horizontal_fov_deg
+        check_fov("camera.horizontal_fov_deg", made.projection, fov_deg)
+        check_distortion("camera.distortion", made.projection, fov_deg, made.distortion)
         check_matched("camera.kind", made)
         check_rows("camera.height_px", made)
         return made

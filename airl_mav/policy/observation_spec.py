@@ -13,7 +13,9 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core import plugins
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.policy.scans import goes_round
+from airl_mav.profiles.camera import Coefficients
 from airl_mav.profiles.camera_kind import CHANNELS, CameraKind
+from airl_mav.profiles.distortion import UNDISTORTED, check_distortion, distorted, undistorted
 from airl_mav.profiles.projection import CYLINDER_MOST_DEG, Projection, check_fov
 
 SHIPPED = ("body", "paper", "scan")
@@ -35,6 +37,9 @@ that a convolution sees what is behind the vehicle in one piece."""
 
 LEAST_ROWS = 4
 """Of an image that goes into a network: all but a scan's, which is a row for each frame."""
+
+SAME_DEG = 0.1
+"""Two lenses are the same where no place of their images is seen at angles farther apart [deg]."""
 
 MOST_FRAMES = 8
 """Most images that a network sees at a time."""
@@ -72,13 +77,16 @@ class ObservationSpec(ProfileModel):
     projection: Projection = Field(
         default="pinhole",
         description="how directions fall on the image: pinhole, cylindrical for a field of view of"
-        " up to 360 deg, or fisheye (equidistant) of up to 190 deg",
+        " up to 360 deg, or fisheye (equidistant but for its distortion) of up to 190 deg",
     )
     horizontal_fov_deg: float = quantity(
         "horizontal field of view, less than 170 with a pinhole",
         "deg",
         gt=10,
         le=CYLINDER_MOST_DEG,
+    )
+    distortion: Coefficients = quantity(
+        "coefficients k1, k2, k3, k4 of a fisheye", "1", default=UNDISTORTED
     )
     range_m: float = quantity(
         "depth from which on everything looks far; rgb and grey images have no such depth",
@@ -104,6 +112,8 @@ class ObservationSpec(ProfileModel):
         data: dict[str, Any] = dump(self)
         if not self.goal_height:
             data.pop("goal_height", None)
+        if self.distortion == UNDISTORTED:
+            data.pop("distortion", None)
         return data
 
     @model_validator(mode="after")
@@ -129,6 +139,7 @@ class ObservationSpec(ProfileModel):
         if self.goal_height and self.layout == "paper":
             raise ValueError("goal_height = true: accepted: false with layout 'paper'")
         check_fov("horizontal_fov_deg", self.projection, self.horizontal_fov_deg)
+        check_distortion("distortion", self.projection, self.horizontal_fov_deg, self.distortion)
         return self
 
     @property
@@ -172,8 +183,8 @@ class Box(NamedTuple):
 def camera_mismatch(spec: ObservationSpec, camera: Intrinsics) -> str | None:
     """Return why a camera cannot serve a layout, or None when it can.
 
-    It gives what the network takes, its image is a whole multiple of the network's, projection and
-    field of view are the same.
+    It gives what the network takes, its image is a whole multiple of the network's, projection,
+    field of view and distortion are the same.
     """
     if camera.kind != spec.kind:
         return f"{camera.kind} camera; accepted: {spec.kind}"
@@ -190,9 +201,30 @@ def camera_mismatch(spec: ObservationSpec, camera: Intrinsics) -> str | None:
     if camera.projection != spec.projection:
         return f"{camera.projection} camera; accepted: {spec.projection}"
     fov_deg = math.degrees(camera.horizontal_fov_rad)
-    if abs(fov_deg - spec.horizontal_fov_deg) > 0.1:
+    if abs(fov_deg - spec.horizontal_fov_deg) > SAME_DEG:
         return (
             f"camera with a horizontal field of view of {fov_deg:.1f} deg; "
             f"accepted: {spec.horizontal_fov_deg:.1f} deg"
         )
+    if (apart_deg := _apart_deg(spec, camera)) > SAME_DEG:
+        return (
+            f"camera with a distortion of {list(camera.distortion)}, {apart_deg:.1f} deg away;"
+            f" accepted: {list(spec.distortion)}"
+        )
     return None
+
+
+def _apart_deg(spec: ObservationSpec, camera: Intrinsics) -> float:
+    """Return how far apart two lenses see, at most, what they have in one place of the image.
+
+    Their fields of view are the same; this is between the middle of the image and its edge [deg].
+    """
+    if spec.distortion == camera.distortion:
+        return 0.0
+    half = 0.5 * math.radians(spec.horizontal_fov_deg)
+    rim = float(distorted(half, spec.distortion))
+    places = np.linspace(0.0, 1.0, 65)
+    theirs = undistorted(places * (0.5 * camera.width / camera.focal), camera.distortion)
+    apart = np.abs(undistorted(places * rim, spec.distortion) - theirs)
+    # The edge itself may lie beyond the rim of either, by rounding.
+    return math.degrees(float(np.max(apart[np.isfinite(apart)])))

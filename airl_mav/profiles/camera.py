@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.errors import FieldError
-from airl_mav.core.fields import ProfileModel, quantity
+from airl_mav.core.fields import Each, ProfileModel, quantity
 from airl_mav.profiles.camera_kind import CameraKind
+from airl_mav.profiles.distortion import (
+    MOST_COEFFICIENT,
+    UNDISTORTED,
+    Distortion,
+    check_distortion,
+)
 from airl_mav.profiles.imaging import Imaging
 from airl_mav.profiles.projection import CYLINDER_MOST_DEG, Projection, check_fov
 
 LEAST_ROWS = 6
 """Of an image that is no cylinder's."""
+
+Coefficients = Annotated[Distortion, Each(-MOST_COEFFICIENT, MOST_COEFFICIENT)]
+"""Of a fisheye."""
 
 
 class Stereo(ProfileModel):
@@ -59,7 +68,7 @@ class Camera(ProfileModel):
     projection: Projection = Field(
         default="pinhole",
         description="pinhole, cylindrical for a field of view of up to 360 deg, or fisheye"
-        " (equidistant) of up to 190 deg",
+        " (equidistant but for its distortion) of up to 190 deg",
     )
     width_px: int = quantity("image width", "px", ge=8, le=640)
     height_px: int = quantity(
@@ -73,6 +82,13 @@ class Camera(ProfileModel):
         "deg",
         gt=10,
         le=CYLINDER_MOST_DEG,
+    )
+    distortion: Coefficients = quantity(
+        "coefficients k1, k2, k3, k4 of a fisheye, as OpenCV's fisheye calibration and ROS's"
+        " equidistant model have them: theta_d = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 +"
+        " k4 theta^8), which must increase over the field of view",
+        "1",
+        default=UNDISTORTED,
     )
     range_m: float = quantity(
         "farthest depth returned; rgb and grey cameras see without limit", "m", gt=0.5, le=65
@@ -99,6 +115,9 @@ class Camera(ProfileModel):
     @model_validator(mode="after")
     def _projects(self) -> Camera:
         check_fov("camera.horizontal_fov_deg", self.projection, self.horizontal_fov_deg)
+        check_distortion(
+            "camera.distortion", self.projection, self.horizontal_fov_deg, self.distortion
+        )
         check_rows("camera.height_px", self)
         if self.stereo is not None and self.projection != "pinhole":
             raise FieldError(
@@ -115,6 +134,8 @@ class Camera(ProfileModel):
             data.pop("kind", None)
         if self.projection == "pinhole":
             data.pop("projection", None)
+        if self.distortion == UNDISTORTED:
+            data.pop("distortion", None)
         if self.stereo is None:
             data.pop("stereo", None)
         if self.ranging is None:

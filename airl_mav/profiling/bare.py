@@ -108,7 +108,8 @@ def random_observations(
     spec, lens = policy.card.observation, policy.camera
     if camera_mismatch(spec, lens) is not None:
         fov = math.radians(spec.horizontal_fov_deg)
-        lens = Intrinsics.from_fov(spec.width_px, spec.camera_rows, fov, spec.projection, spec.kind)
+        size = spec.width_px, spec.camera_rows
+        lens = Intrinsics.from_fov(*size, fov, spec.projection, spec.kind, spec.distortion)
     rng = np.random.default_rng((request.seed, OBSERVATION_STREAM))
     level = np.array([1.0, 0.0, 0.0, 0.0])
     brightest = 20_000 if lens.kind == "depth" else 256

@@ -125,6 +125,7 @@ def _write_random_network(
             "height_px": height_px,
             "projection": camera.projection,
             "horizontal_fov_deg": camera.horizontal_fov_deg,
+            "distortion": camera.distortion,
             "range_m": camera.range_m,
         }
         try:

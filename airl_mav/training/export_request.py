@@ -20,6 +20,7 @@ from airl_mav.policy.actions import DecisionTiming
 from airl_mav.policy.card import PolicyFacts, Training
 from airl_mav.policy.observation_spec import LayoutName, ObservationSpec
 from airl_mav.profiles.camera_kind import CameraKind
+from airl_mav.profiles.distortion import UNDISTORTED
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.projection import Projection
 from airl_mav.profiles.vehicle import load_vehicle
@@ -28,7 +29,10 @@ from airl_mav.scenario.model import PilotSettings
 FLOWN = ("hold_s", "goal_radius_m", "altitude_m", "hover_after_s")
 """How a policy is flown: fields of the request, of a card and of an environment's episodes."""
 
-SEEN = ("layout", "frames", "kind", "projection", "horizontal_fov_deg", "range_m", "goal_height")
+SEEN = (
+    *("layout", "frames", "kind", "projection", "horizontal_fov_deg", "distortion", "range_m"),
+    "goal_height",
+)
 """What a policy sees but for the image's size: fields of the request and of a card."""
 
 DEFAULTS: dict[str, Any] = {
@@ -38,6 +42,7 @@ DEFAULTS: dict[str, Any] = {
     "kind": "depth",
     "projection": "pinhole",
     "horizontal_fov_deg": 90.0,
+    "distortion": UNDISTORTED,
     "range_m": 20.0,
     "goal_height": False,
     "actions": "arc-25",
@@ -247,6 +252,7 @@ def _known_of(spec: EnvironmentSpec) -> dict[str, Any]:
         "kind": camera.kind,
         "projection": camera.projection,
         "horizontal_fov_deg": camera.horizontal_fov_deg,
+        "distortion": camera.distortion,
         "range_m": camera.range_m,
         "goal_height": spec.goal_height,
         "actions": spec.actions,

@@ -55,18 +55,10 @@ def open_named_camera(name: str, clock: Clock, wanted: Intrinsics, whose: str) -
 
     Raises:
         FieldError: There is no such camera, it sees too little of what is wanted, or it gives
-            depth of a pinhole where a cylinder or colour is wanted.
+            depth where colour is wanted.
     """
     if "://" in name:
         return open_camera(name, clock)
-    if wanted.projection != "pinhole":
-        raise FieldError(
-            "camera",
-            name,
-            problem=f"drivers give images of a pinhole, the camera of {whose} is"
-            f" {'a fisheye' if wanted.projection == 'fisheye' else 'cylindrical'};"
-            " accepted: tcp://HOST:PORT or ipc://PATH of a publisher of such images",
-        )
     if wanted.kind != "depth":
         raise FieldError(
             "camera",

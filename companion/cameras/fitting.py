@@ -1,9 +1,9 @@
 """Makes a camera's images those of the vehicle profile's camera, with which policies are trained.
 
-The profile's camera is a pinhole of few pixels, in the middle of what a real one sees. Each of its
-pixels is looked up in the camera's image at the points of a grid, and the nearest return of them
-wins: the function with which the shipped layouts shrink an image for the network, so a thin
-obstacle is not lost, and a hole of the stereo matcher is "no return" only where all points are.
+The profile's camera has few pixels, in the middle of what a real one sees. Each of its pixels is
+looked up in the camera's image at the points of a grid, and the nearest return of them wins: the
+function with which the shipped layouts shrink an image for the network, so a thin obstacle is not
+lost, and a hole of the stereo matcher is "no return" only where all points are.
 """
 
 from __future__ import annotations
@@ -14,12 +14,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.camera.frame import MAX_MM
 from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.rays import finer, rays_of
 from airl_mav.core.errors import FieldError
 from airl_mav.policy.images import nearest_returns
+from airl_mav.profiles.distortion import Distortion, distorted, sees_to, undistorted
 
 MOST_POINTS = 16
 """Points looked up along each side of a pixel, at most."""
+
+LEAST_FORWARD = 1e-3
+"""Of a ray in whose direction anything has a depth along the optical axis."""
 
 LEAST_COVERAGE = 0.9
 """Share of the wanted image that a camera must see. A D435 at the end of its tolerance, 84 degrees
@@ -28,10 +34,12 @@ wide instead of 87, sees 0.91 of the image of the vehicle profile `quad-d435`.""
 
 @dataclass(frozen=True)
 class Lens:
-    """A pinhole camera whose images are free of distortion, as depth cameras deliver them.
+    """A pinhole whose images are free of distortion, as depth cameras deliver them, or a fisheye.
 
-    A pixel (u, v) looks along ((u - cx) / fx, (v - cy) / fy, 1) in the optical frame (right, down,
-    forward). Pixel centres are at whole numbers, as in librealsense and ROS 2's CameraInfo.
+    A pixel (u, v) of a pinhole looks along ((u - cx) / fx, (v - cy) / fy, 1) in the optical frame
+    (right, down, forward). Pixel centres are at whole numbers, as in librealsense and ROS 2's
+    CameraInfo. Depth is along the optical axis of either, which no more than 90 degrees from it
+    anything has.
     """
 
     width: int
@@ -42,39 +50,56 @@ class Lens:
     """Focal length in rows [px]."""
     cx: float
     cy: float
+    distortion: Distortion | None = None
+    """Coefficients of a fisheye, Kannala and Brandt's; None: a pinhole."""
 
     @property
     def field_of_view(self) -> str:
         """Horizontal and vertical field of view, in words."""
-        wide = 2.0 * math.degrees(math.atan2(0.5 * self.width, self.fx))
-        high = 2.0 * math.degrees(math.atan2(0.5 * self.height, self.fy))
-        return f"{wide:.0f} x {high:.0f} deg"
+        sides = (0.5 * self.width / self.fx, 0.5 * self.height / self.fy)
+        return _in_words(*(_half_rad(side, self.distortion) for side in sides))
 
     @classmethod
     def of(cls, k: Intrinsics) -> Lens:
-        """Return the lens of a profile's camera, a pinhole."""
-        return cls(k.width, k.height, k.focal, k.focal, k.cx, k.cy)
+        """Return the lens of a profile's camera, a pinhole or a fisheye."""
+        bent = k.distortion if k.projection == "fisheye" else None
+        return cls(k.width, k.height, k.focal, k.focal, k.cx, k.cy, bent)
 
 
 class Fitting:
     """From the images of one camera to those of another that looks the same way."""
 
     def __init__(self, lens: Lens, wanted: Intrinsics) -> None:
-        """Find where each pixel of the wanted camera, a pinhole, lies in the images of the lens."""
+        """Find where each pixel of the wanted camera lies in the images of the lens."""
         self.wanted = wanted
         """What `fit` returns images of."""
         points = math.ceil(max(lens.fx, lens.fy) / wanted.focal)
         points = min(max(points, 1), MOST_POINTS)
-        self._columns, off_side = _places(
-            *(wanted.width, wanted.focal, wanted.cx), *(lens.width, lens.fx, lens.cx), points
-        )
-        self._rows, off_end = _places(
-            *(wanted.height, wanted.focal, wanted.cy), *(lens.height, lens.fy, lens.cy), points
-        )
-        self._unseen = off_end[:, None] | off_side[None, :]
         self._shape = lens.height, lens.width
-        self.coverage = 1.0 - float(self._unseen.mean())
-        """Share of the wanted image that the lens sees, 0 to 1."""
+        self._deeper: NDArray[np.float32] | None = None
+        """What depth along the axis is multiplied with; None: it is what is wanted."""
+        if lens.distortion is None and wanted.projection == "pinhole":
+            columns, off_side = _places(
+                *(wanted.width, wanted.focal, wanted.cx), *(lens.width, lens.fx, lens.cx), points
+            )
+            rows, off_end = _places(
+                *(wanted.height, wanted.focal, wanted.cy), *(lens.height, lens.fy, lens.cy), points
+            )
+            self._rows, self._columns = rows[:, None], columns[None, :]
+            self._unseen = off_end[:, None] | off_side[None, :]
+            self.coverage = 1.0 - float(self._unseen.mean())
+            """Share of the wanted image that the lens sees, 0 to 1."""
+            return
+        rays = rays_of(finer(wanted, points))
+        row, column = _looked_up(lens, rays)
+        inside = (row >= 0) & (row < lens.height) & (column >= 0) & (column < lens.width)
+        self._rows = np.where(inside, row, 0).astype(np.intp)
+        self._columns = np.where(inside, column, 0).astype(np.intp)
+        self._unseen = ~inside
+        self.coverage = float(inside[rays.any(axis=0)].mean())
+        if wanted.projection != "pinhole":
+            deeper = np.divide(1.0, rays[0], out=np.ones_like(rays[0]), where=inside)
+            self._deeper = deeper.astype(np.float32)
 
     def fit(self, depth_mm: NDArray[np.uint16]) -> NDArray[np.uint16]:
         """Return the wanted image (wanted.height, wanted.width) [mm]; 0 = no return.
@@ -89,12 +114,55 @@ class Fitting:
             raise ValueError(
                 f"an image of {depth_mm.dtype} {depth_mm.shape}; accepted: uint16 {self._shape}"
             )
-        seen = depth_mm[np.ix_(self._rows, self._columns)]
+        seen = depth_mm[self._rows, self._columns]
         seen[self._unseen] = 0
+        if self._deeper is not None:
+            seen = np.minimum(np.rint(seen * self._deeper), MAX_MM).astype(np.uint16)
         # Values of nearest_returns are one less; "no return" wraps back to 0.
         nearest = nearest_returns(seen[None], self.wanted.height, self.wanted.width)
         fitted: NDArray[np.uint16] = nearest[0] + np.uint16(1)
         return fitted
+
+
+def _looked_up(
+    lens: Lens, rays: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the rows and columns (h, w) of a lens, rounded, on which rays (3, h, w) fall.
+
+    They are -1 where a ray falls on none: it points to the side, or backwards.
+    """
+    forward, right, down = rays
+    ahead = forward > LEAST_FORWARD
+    if lens.distortion is None:
+        scale = 1.0 / np.where(ahead, forward, 1.0)
+    else:
+        aside = np.hypot(right, down)
+        off = np.arctan2(aside, forward)
+        ahead &= off <= sees_to(lens.distortion)
+        scale = distorted(off, lens.distortion) / np.maximum(aside, 1e-9)
+    row, column = (
+        np.rint(lens.cy + lens.fy * down * scale),
+        np.rint(lens.cx + lens.fx * right * scale),
+    )
+    return np.where(ahead, row, -1.0), np.where(ahead, column, -1.0)
+
+
+def _half_rad(side: float, distortion: Distortion | None) -> float:
+    """Return the angle from the axis to an edge that is so many focal lengths off [rad]."""
+    if distortion is None:
+        return math.atan(side)
+    return min(float(undistorted(np.array(side), distortion)), sees_to(distortion))
+
+
+def _in_words(half_wide_rad: float, half_high_rad: float) -> str:
+    wide, high = 2.0 * math.degrees(half_wide_rad), 2.0 * math.degrees(half_high_rad)
+    return f"{wide:.0f} x {high:.0f} deg"
+
+
+def _seen_by(k: Intrinsics) -> str:
+    """Return the field of view of a profile's camera, in words."""
+    bent = k.distortion if k.projection == "fisheye" else None
+    return _in_words(0.5 * k.horizontal_fov_rad, _half_rad(0.5 * k.height / k.focal, bent))
 
 
 def _places(
@@ -108,7 +176,8 @@ def _places(
 ) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
     """Return for each point along one axis its nearest pixel of the lens, and whether it has none.
 
-    Both (size x points,); where there is none the pixel is one at the edge.
+    For a pinhole in a pinhole, whose rows and columns are apart from each other. Both (size x
+    points,); where there is none the pixel is one at the edge.
     """
     at = (np.arange(size * points) + 0.5) / points - 0.5
     place = np.rint(lens_centre + lens_focal * (at - centre) / focal).astype(np.intp)
@@ -130,7 +199,7 @@ def check_coverage(name: str, lens: Lens, fitting: Fitting, whose: str) -> None:
         "camera",
         name,
         problem=f"it sees {lens.field_of_view}: {100.0 * fitting.coverage:.0f} % of what the camera"
-        f" of {whose} sees ({Lens.of(fitting.wanted).field_of_view}); accepted: at least"
+        f" of {whose} sees ({_seen_by(fitting.wanted)}); accepted: at least"
         f" {100.0 * LEAST_COVERAGE:.0f} %. Name a vehicle profile whose [camera] is yours, and a"
         " policy trained with it",
     )

@@ -152,7 +152,7 @@ class Ros2Camera:
                 f" (ROS_DOMAIN_ID {_domain()})",
             )
         try:
-            self._lens = lens_of(info)
+            self._lens = lens_of(info, topic)
         except ValueError as error:
             raise FieldError("camera", name, problem=f"{described}: {error}") from None
         self._images = self._reader(topic, Image)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from airl_mav.camera.frame import MAX_MM, MM_PER_M
 from airl_mav.core.clock import NS_PER_US
 from airl_mav.core.constants import US_PER_S
+from airl_mav.profiles.distortion import MOST_COEFFICIENT, Distortion
 from companion.cameras.driver import plausible_age_us
 from companion.cameras.fitting import Lens
 
@@ -68,20 +69,33 @@ def age_us(message: Any, now_us: int) -> int:
     return plausible_age_us(now_us - stamped_us(message))
 
 
-def lens_of(message: Any) -> Lens:
+EQUIDISTANT = "equidistant"
+"""The distortion model whose D are the coefficients of Kannala and Brandt, k1 to k4."""
+
+RECTIFIED = "rect"
+"""What names of topics of rectified images have in their last part, by ROS's image_proc."""
+
+
+def lens_of(message: Any, image_topic: str = "") -> Lens:
     """Return the lens that a sensor_msgs/CameraInfo describes.
 
     A camera without distortion is described by K. One with distortion is described by P, which
-    holds for its rectified images alone: those are what drivers are asked for.
+    holds for its rectified images alone: those are what drivers are asked for. A fisheye's images,
+    of the model `equidistant`, are taken as they are, described by K and D, unless the last part of
+    their topic says that they are rectified.
 
     Raises:
-        ValueError: It describes no pinhole, or images that are binned or cropped.
+        ValueError: It describes neither pinhole nor fisheye, or images that are binned or cropped.
     """
     roi = message.roi
     cropped = (roi.width, roi.height) not in ((0, 0), (message.width, message.height))
     if max(message.binning_x, message.binning_y) > 1 or cropped:
         raise ValueError("binned or cropped images; accepted: whole ones")
     distorts = any(abs(each) > 0.0 for each in message.d)
+    rectified = RECTIFIED in image_topic.rpartition("/")[2]
+    fisheye = message.distortion_model == EQUIDISTANT and not rectified
+    coefficients = _coefficients(message) if fisheye else None
+    distorts &= not fisheye
     fx, cx, fy, cy = (
         (message.p[0], message.p[2], message.p[5], message.p[6])
         if distorts
@@ -89,7 +103,19 @@ def lens_of(message: Any) -> Lens:
     )
     if not (np.isfinite([fx, fy, cx, cy]).all() and min(fx, fy) > 0.0 and message.width):
         raise ValueError(f"a camera of focal lengths {fx:g} and {fy:g} px, which is no pinhole")
-    return Lens(message.width, message.height, fx, fy, cx, cy)
+    return Lens(message.width, message.height, fx, fy, cx, cy, coefficients)
+
+
+def _coefficients(message: Any) -> Distortion:
+    """Return those of a fisheye's description. Raises ValueError where they are none."""
+    told = [float(each) for each in message.d]
+    if len(told) != 4 or not all(abs(each) <= MOST_COEFFICIENT for each in told):
+        raise ValueError(
+            f"D {told} of the model {EQUIDISTANT}; accepted: four numbers from"
+            f" -{MOST_COEFFICIENT:g} to {MOST_COEFFICIENT:g}"
+        )
+    k1, k2, k3, k4 = told
+    return k1, k2, k3, k4
 
 
 def info_topic(image_topic: str) -> str:

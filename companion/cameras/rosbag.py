@@ -81,7 +81,7 @@ class RosBag:
                 "camera", name, problem=f"no sensor_msgs/CameraInfo on {described} in it"
             )
         try:
-            return lens_of(next(self._messages(described))[1])
+            return lens_of(next(self._messages(described))[1], self._topic)
         except (StopIteration, ValueError) as error:
             raise FieldError("camera", name, problem=f"{described}: {error or 'empty'}") from None
 

@@ -21,12 +21,14 @@ from airl_mav.camera.render import Motion
 from airl_mav.core.constants import TICK_US
 from airl_mav.core.frames import quat_from_euler
 from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.camera_kind import Renderer
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import load_vehicle
 from firmware_sim.flight_controller import FirmwareLostError
 from firmware_sim.plant.camera_process import CameraProcess, SlowCamera
 from firmware_sim.plant.camera_server import SimulatedCamera
+from tests.support.lenses import BARREL
 
 RATE_HZ = 20.0
 SLOT_US = 50_000
@@ -41,6 +43,9 @@ CAMERA = load_vehicle("quad").camera.model_copy(
     update={"rate_hz": RATE_HZ, "width_px": 32, "height_px": 24}
 )
 COLOUR = CAMERA.model_copy(update={"kind": "rgb"})
+FISHEYE = COLOUR.model_copy(
+    update={"projection": "fisheye", "horizontal_fov_deg": 170.0, "distortion": BARREL}
+)
 
 
 @pytest.fixture(scope="module")
@@ -78,12 +83,11 @@ def fly(camera: SlowCamera, from_us: int, until: Callable[[list[Frame]], bool]) 
     return seen
 
 
-def the_same_in_place(frames: list[Frame], start_us: int, renderer: Renderer = "raycast") -> None:
+def the_same_in_place(
+    frames: list[Frame], start_us: int, renderer: Renderer = "raycast", camera: Camera = CAMERA
+) -> None:
     """Hold frames against a camera that takes its time in the place of ticks."""
-    kind = frames[0].intrinsics.kind
-    drawn = SimulatedCamera(
-        COLOUR if kind == "rgb" else CAMERA, arena(), start_us, None, 3, renderer
-    )
+    drawn = SimulatedCamera(camera, arena(), start_us, None, 3, renderer)
     for frame in frames:
         expected = drawn.take(frame.capture_time_us, moving(frame.capture_time_us))
         np.testing.assert_array_equal(frame.image, expected.image)
@@ -141,10 +145,13 @@ def test_one_process_serves_one_episode_after_the_other(process: CameraProcess) 
     the_same_in_place(fly(camera, 40_000, lambda seen: len(seen) == 2), 40_000)
 
 
-def test_path_traced_images_are_those_of_lockstep(process: CameraProcess) -> None:
+@pytest.mark.parametrize("which", [COLOUR, FISHEYE], ids=["pinhole", "fisheye"])
+def test_path_traced_images_are_those_of_lockstep(which: Camera, process: CameraProcess) -> None:
     pytest.importorskip("mitsuba")
-    camera = process.camera(COLOUR, arena(), 0, None, 3, "mitsuba")
-    the_same_in_place(fly(camera, 0, lambda seen: len(seen) == 2), 0, "mitsuba")
+    camera = process.camera(which, arena(), 0, None, 3, "mitsuba")
+    frames = fly(camera, 0, lambda seen: len(seen) == 2)
+    assert frames[0].intrinsics.projection == which.projection
+    the_same_in_place(frames, 0, "mitsuba", which)
 
 
 def test_a_process_that_dies_ends_the_flight_in_one_line() -> None:

@@ -19,11 +19,13 @@ from airl_mav.envs.fleet import Fleet, new_fleet
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import load_vehicle
+from tests.support.lenses import OPENING
 
 N = 12
 CAMERA = Intrinsics.from_fov(64, 48, math.radians(87.0))
 PANORAMA = Intrinsics.of(load_vehicle("quad-panorama").camera)
 FISHEYE = Intrinsics.from_fov(64, 48, math.radians(170.0), "fisheye")
+BENT = Intrinsics.from_fov(64, 48, math.radians(170.0), "fisheye", distortion=OPENING)
 MOUNT = Mount((0.12, 0.03, -0.02), math.radians(8.0))
 
 
@@ -53,7 +55,9 @@ def expected(
 
 
 @pytest.mark.parametrize(
-    "camera", [CAMERA, PANORAMA, FISHEYE], ids=["pinhole", "cylindrical", "fisheye"]
+    "camera",
+    [CAMERA, PANORAMA, FISHEYE, BENT],
+    ids=["pinhole", "cylindrical", "fisheye", "distorted"],
 )
 @pytest.mark.parametrize("range_m", [6.0, 20.0, 100.0])
 def test_sees_what_the_rehearsal_s_camera_sees(

@@ -24,9 +24,11 @@ from airl_mav.envs.meshes import MeshesSeen
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from tests.support.command_line import airl
+from tests.support.lenses import BARREL
 
 MOUNT = Mount((0.1, 0.0, 0.02), 0.1)
 CAMERA = Intrinsics.from_fov(48, 32, 1.5)
+FISHEYE = Intrinsics.from_fov(48, 32, 2.8, "fisheye", distortion=BARREL)
 RANGE_M = 25.0
 
 PROFILE = """
@@ -84,19 +86,22 @@ def test_the_worlds_have_meshes_of_both_kinds(worlds: list[Arena]) -> None:
 
 
 @pytest.mark.timeout(600)  # compiles kernels, on a busy machine for minutes
-def test_depth_is_bit_for_bit_that_of_the_rehearsal(worlds: list[Arena]) -> None:
+@pytest.mark.parametrize("camera", [CAMERA, FISHEYE], ids=["pinhole", "fisheye"])
+def test_depth_is_bit_for_bit_that_of_the_rehearsal(
+    worlds: list[Arena], camera: Intrinsics
+) -> None:
     n = len(worlds)
     seen, arenas, differ = seen_of(worlds), batch_of(worlds), 0
     for _ in range(6):
         fleet = scattered(n)
-        out = np.zeros((n, CAMERA.height, CAMERA.width), np.uint16)
-        lens = lens_of(CAMERA, RANGE_M)
+        out = np.zeros((n, camera.height, camera.width), np.uint16)
+        lens = lens_of(camera, RANGE_M)
         render_images(fleet, arenas, np.ones(n, np.bool_), MOUNT, lens, out, seen.batch)
         for i, world in enumerate(worlds):
             pose = camera_pose(fleet.position[i], fleet.quaternion[i], MOUNT)
             centers = world.centers_at(0)
             assert np.array_equal(
-                out[i], depth_to_z16(render(world, centers, CAMERA, RANGE_M, *pose))
+                out[i], depth_to_z16(render(world, centers, camera, RANGE_M, *pose))
             )
     boxes = np.zeros_like(out)
     render_images(fleet, arenas, np.ones(n, np.bool_), MOUNT, lens, boxes, None)
@@ -109,19 +114,22 @@ def test_depth_is_bit_for_bit_that_of_the_rehearsal(worlds: list[Arena]) -> None
 # test_colour_flight.py, a mesh in colour in test_meshes_seen.py. Together they compile for minutes.
 @pytest.mark.nightly
 @pytest.mark.timeout(600)  # compiles kernels, on a busy machine for minutes
-def test_colour_is_bit_for_bit_that_of_the_rehearsal(worlds: list[Arena]) -> None:
+@pytest.mark.parametrize("camera", [CAMERA, FISHEYE], ids=["pinhole", "fisheye"])
+def test_colour_is_bit_for_bit_that_of_the_rehearsal(
+    worlds: list[Arena], camera: Intrinsics
+) -> None:
     n = len(worlds)
     seen, looks, arenas = seen_of(worlds), Looks(n), batch_of(worlds)
     for i, world in enumerate(worlds):
         looks.put(i, world)
-    twin = ColourImages(CAMERA, MOUNT, looks, seen)
+    twin = ColourImages(camera, MOUNT, looks, seen)
     fleet = scattered(n)
-    out = np.zeros((n, CAMERA.height, CAMERA.width, 3), np.uint8)
+    out = np.zeros((n, camera.height, camera.width, 3), np.uint8)
     twin.render(fleet, arenas, np.ones(n, np.bool_), out)
     pixels = 0
     for i, world in enumerate(worlds):
         pose = camera_pose(fleet.position[i], fleet.quaternion[i], MOUNT)
-        picture = render_picture(world, world.centers_at(0), CAMERA, *pose)
+        picture = render_picture(world, world.centers_at(0), camera, *pose)
         assert np.array_equal(out[i], picture.rgb)
         pixels += mesh_pixels(world, picture.seen)
     assert pixels > 50

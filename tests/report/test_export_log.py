@@ -32,6 +32,7 @@ from airl_mav.report.recorded_flight import episode_of
 from airl_mav.report.replay.runs import ReplayedRun
 from tests.support.command_line import airl, option_words
 from tests.support.flown_here import flown_here
+from tests.support.lenses import angles
 from tests.support.mcap_kit import ReadMcap, distances_to, read_mcap, turn_of, xyz
 
 ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
@@ -108,6 +109,43 @@ def test_every_pose_is_that_of_the_recording(flown: LoadedRun, told: ReadMcap) -
         expected = ENU_FROM_NED @ turns @ FLU_FROM_FRD
         found = np.array([turn_of(pose.rotation).as_matrix() for pose in poses])
         np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+FISHEYE = """
+base = "quad"
+description = "a fisheye with coefficients"
+[camera]
+projection = "fisheye"
+width_px = 48
+height_px = 48
+horizontal_fov_deg = 150.0
+distortion = [-0.05, 0.008, -0.0045, 0.0004]
+"""
+
+
+def test_a_fisheye_is_calibrated_as_one(tmp_path: Path) -> None:
+    """Every pixel, led through calibration as OpenCV has it, ends where the arena is."""
+    pytest.importorskip("foxglove", reason="needs the [export] extra")
+    vehicle = tmp_path / "wide.toml"
+    vehicle.write_text(FISHEYE, encoding="utf-8")
+    asked: dict[str, Any] = {"arena": "no-obstacles", "episodes": 1, "time_limit_s": 4.0}
+    run = fly(tmp_path / "run", vehicle=str(vehicle), **asked)
+    airl("export_log", str(run), "0", "--out", str(tmp_path / "log"))
+    told = read_mcap(tmp_path / "log" / "flight-000.mcap")
+    (calibration,) = told.of("/camera/calibration")
+    assert calibration.distortion_model == "kannala_brandt"
+    assert list(calibration.D) == [-0.05, 0.008, -0.0045, 0.0004]
+    f, _, cx, _, _, cy, *_ = calibration.K
+    image = told.of("/camera/depth")[0]
+    depth = np.frombuffer(image.data, "<u2").reshape(image.height, image.width) / 1000.0
+    v, u = np.nonzero(depth)
+    out = np.hypot(u - cx, v - cy) / f
+    off = angles(out, (-0.05, 0.008, -0.0045, 0.0004))
+    # Level at the beginning, above the floor: by the range along the ray.
+    below = depth[v, u] * np.sin(off) * (v - cy) / f / out
+    flat = below[below > 0.98 * below.max()]
+    assert len(flat) > 0.3 * len(below)
+    assert flat.std() < 0.02
 
 
 def test_what_the_camera_saw_lies_on_the_bodies_of_the_scene(

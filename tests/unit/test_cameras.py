@@ -7,6 +7,7 @@ import re
 import sys
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,16 +18,19 @@ from numpy.typing import NDArray
 from airl_mav.arena.generate import generate
 from airl_mav.camera.frame import MAX_MM, depth_to_z16
 from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.rays import finer
 from airl_mav.camera.render import render
 from airl_mav.core.clock import SimClock, WallClock
 from airl_mav.core.errors import FieldError
 from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.profiles.distortion import UNDISTORTED
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.stand_alone import StandAloneCompanion, check_companion
 from companion.cameras.by_name import open_named_camera
 from companion.cameras.driver import CameraThread, DepthImage
 from companion.cameras.fitting import Fitting, Lens, check_coverage
+from tests.support.lenses import BARREL, OPENING, rays_of_fisheye
 
 WANTED = Intrinsics.from_fov(64, 48, math.radians(90.0))
 WIDE = Lens(848, 636, 424.0, 424.0, 423.5, 317.5)
@@ -80,6 +84,67 @@ def test_every_ray_of_the_arena_ends_where_the_wanted_camera_sees_it(dense: Lens
     # and columns where a surface recedes.
     assert np.quantile(nearer_mm, 0.02) > -100
     assert np.median(np.abs(nearer_mm) / centre[known]) < 0.03
+
+
+FISHEYE = Intrinsics(720, 720, 240.0, 355.0, 362.0, "fisheye", distortion=BARREL)
+"""Sees to its circle's rim, at 95 degrees."""
+
+
+def seen_by(camera: Intrinsics) -> NDArray[np.uint16]:
+    """Return the depth image [mm] of an arena."""
+    spec = load_profile("arenas", "dense-obstacles", ArenaSpec)
+    arena = generate(spec, 7, name="test", vehicle_width_m=0.6)
+    pose = np.array([0.0, 0.0, -1.5]), np.array([1.0, 0.0, 0.0, 0.0])
+    return depth_to_z16(render(arena, arena.obstacles.center, camera, 20.0, *pose))
+
+
+@pytest.mark.parametrize(
+    ("wanted", "least"),
+    [
+        (WANTED, 1.0),
+        (Intrinsics.from_fov(64, 48, math.radians(150.0), "fisheye", distortion=OPENING), 1.0),
+        (Intrinsics.from_fov(64, 64, math.radians(180.0), "fisheye"), 0.92),
+        (Intrinsics.from_fov(64, 24, math.radians(140.0), "cylindrical"), 1.0),
+    ],
+    ids=["pinhole", "fisheye", "half", "cylinder"],
+)
+def test_a_fisheye_s_depth_along_its_axis_becomes_what_is_wanted(
+    wanted: Intrinsics, least: float
+) -> None:
+    """The nearest return of 64 rays a pixel, by the ray caster, is the reference."""
+    rays = np.nan_to_num(rays_of_fisheye(FISHEYE))
+    # What it sees as a camera of ROS has it: depth along the axis, none to the side.
+    along = np.rint(seen_by(FISHEYE) * np.maximum(rays[..., 0], 0.0)).astype(np.uint16)
+    fitting = Fitting(Lens.of(FISHEYE), wanted)
+    assert fitting.coverage >= least
+    fitted, dense = fitting.fit(along), seen_by(finer(wanted, 8)).astype(int)
+    blocks = np.where(dense > 0, dense, 1 << 20).reshape(wanted.height, 8, wanted.width, 8)
+    nearest = blocks.min(axis=(1, 3))
+    known = (fitted > 0) & (nearest < 1 << 20)
+    assert known.mean() > 0.4
+    apart = np.abs(nearest - fitted)[known] / nearest[known]
+    assert np.median(apart) < 0.01
+    # Close to 90 degrees from the axis a millimetre along it is much along the ray.
+    assert np.quantile(apart, 0.8) < 0.05
+    # As a pinhole's or an equidistant fisheye's it is farther off.
+    for other in (None, UNDISTORTED):
+        wrong = Fitting(replace(Lens.of(FISHEYE), distortion=other), wanted)
+        shown = wrong.fit(along)
+        off = np.abs(nearest - shown)[known] / nearest[known]
+        assert wrong.coverage < 0.9 or off.mean() > 1.5 * apart.mean()
+
+
+def test_a_pinhole_serves_a_narrow_cylinder_and_no_wide_one() -> None:
+    narrow = Intrinsics.from_fov(60, 24, math.radians(80.0), "cylindrical")
+    dense = Intrinsics(WIDE.width, WIDE.height, WIDE.fx, WIDE.cx, WIDE.cy)
+    fitting = Fitting(WIDE, narrow)
+    assert fitting.coverage == 1.0
+    fitted, centre = fitting.fit(seen_by(dense)), seen_by(narrow)
+    known = (fitted > 0) & (centre > 0)
+    assert np.median(np.abs(fitted[known].astype(int) - centre[known]) / centre[known]) < 0.03
+    round_about = Intrinsics.of(load_vehicle("quad-panorama").camera)
+    with pytest.raises(FieldError, match=r"90 x 74 deg: 17 % of .* sees \(360 x 89 deg"):
+        check_coverage("mine", WIDE, Fitting(WIDE, round_about), "vehicle quad-panorama")
 
 
 def test_rows_and_columns_have_a_focal_length_of_their_own() -> None:
@@ -299,17 +364,6 @@ def test_a_library_that_is_not_installed_is_named(
     with pytest.raises(FieldError, match=told) as caught:
         open_named_camera(name, SimClock(), WANTED, "vehicle quad")
     assert "\n" not in str(caught.value)
-
-
-def test_a_driver_is_refused_where_a_cylinder_is_wanted(tmp_path: Path) -> None:
-    (tmp_path / "mine.py").write_text(OWN)
-    wanted = Intrinsics.of(load_vehicle("quad-panorama").camera)
-    told = "drivers give images of a pinhole, the camera of vehicle quad-panorama is cylindrical"
-    with pytest.raises(FieldError, match=told) as caught:
-        open_named_camera(
-            f"{tmp_path}/mine.py:Unplugged", SimClock(), wanted, "vehicle quad-panorama"
-        )
-    assert caught.value.field == "camera"
 
 
 def test_a_driver_is_refused_where_colour_is_wanted(tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from airl_mav.profiles.appearance import DEFAULT, Appearance
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.projection import PROJECTIONS, Projection
+from tests.support.lenses import rays_of_fisheye
 
 LEVEL = quat_from_euler(0.0, 0.0, 0.0)
 DOWN = quat_from_euler(0.0, -math.pi / 2, 0.0)
@@ -221,8 +222,7 @@ def rays_of(k: Intrinsics, attitude: NDArray[np.float64]) -> NDArray[np.float64]
     x, y = (u - k.cx) / k.focal, (v - k.cy) / k.focal
     ahead, right = (np.cos(x), np.sin(x)) if k.cylindrical else (np.ones_like(x), x)
     if k.projection == "fisheye":
-        off, plane = np.hypot(x, y), np.arctan2(y, x)
-        ahead, right, y = np.cos(off), np.sin(off) * np.cos(plane), np.sin(off) * np.sin(plane)
+        ahead, right, y = np.moveaxis(np.nan_to_num(rays_of_fisheye(k)), -1, 0)
     rays: NDArray[np.float64] = np.stack([ahead, right, y], -1) @ quat_to_matrix(attitude).T
     return rays
 

@@ -1,4 +1,4 @@
-"""The equidistant fisheye: where directions fall, what its pixels show, and who refuses it."""
+"""The fisheye: where directions fall, what its pixels show, and who refuses it."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from airl_mav.arena.geometry import Arena, Bounds, Obstacles, PlacedMesh, Shape
+from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape
 from airl_mav.camera.equidistant import fisheye_places, fisheye_rays
-from airl_mav.camera.fisheye import check_meshes
 from airl_mav.camera.frame import depth_to_z16
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.picture import render_picture
@@ -26,8 +25,9 @@ from airl_mav.policy.observation_spec import ObservationSpec, camera_mismatch
 from airl_mav.policy.scans import rays_of
 from airl_mav.prediction.reprojection import CameraPose, Reprojector, Sight
 from airl_mav.profiles.appearance import DEFAULT
-from airl_mav.profiles.mesh_file import MeshFile
+from airl_mav.profiles.distortion import UNDISTORTED, Distortion
 from airl_mav.profiles.vehicle import load_vehicle
+from tests.support.lenses import BARREL, OPENING, published, rays_of_fisheye
 from tests.unit.test_colour import arena, busy, poses, sun
 
 WIDE = Intrinsics(191, 191, 180.0 / math.pi, 95.0, 95.0, "fisheye")
@@ -35,6 +35,12 @@ WIDE = Intrinsics(191, 191, 180.0 / math.pi, 95.0, 95.0, "fisheye")
 
 LEVEL = quat_from_euler(0.0, 0.0, 0.0)
 HERE = np.array([0.0, 0.0, -2.0])
+
+
+def wide(distortion: Distortion) -> Intrinsics:
+    """Return a lens that sees to 95 degrees, all within its image."""
+    rim: float = published(math.radians(95.0), distortion)
+    return replace(WIDE, focal=95.0 / rim, distortion=distortion)
 
 
 def ball(off_deg: float, plane_deg: float, distance: float, radius: float) -> Arena:
@@ -54,20 +60,18 @@ def ball(off_deg: float, plane_deg: float, distance: float, radius: float) -> Ar
 
 @pytest.mark.parametrize("off_deg", [0.0, 40.0, 89.0, 93.0])
 @pytest.mark.parametrize("plane_deg", [0.0, -50.0, -170.0])
-def test_a_sphere_covers_the_angles_that_it_is_seen_under(off_deg: float, plane_deg: float) -> None:
+@pytest.mark.parametrize("distortion", [UNDISTORTED, BARREL, OPENING])
+def test_a_sphere_covers_the_angles_that_it_is_seen_under(
+    off_deg: float, plane_deg: float, distortion: Distortion
+) -> None:
     """The half angle asin(radius / distance) about its direction; depth is the range."""
     scene = ball(off_deg, plane_deg, 10.0, 1.5)
-    picture = render_picture(scene, scene.obstacles.center, WIDE, HERE, LEVEL)
+    lens = wide(distortion)
+    picture = render_picture(scene, scene.obstacles.center, lens, HERE, LEVEL)
     towards = (scene.obstacles.center[0] - HERE) / 10.0
-    v, u = np.mgrid[:191, :191]
-    across, down = np.radians(u - 95.0), np.radians(v - 95.0)
-    off: Any = np.hypot(across, down)
-    plane = np.arctan2(down, across)
-    rays = [np.cos(off), np.sin(off) * np.cos(plane), np.sin(off) * np.sin(plane)]
-    cosine: Any = np.tensordot(towards, rays, 1)
-    seen = (np.degrees(np.arccos(cosine)) < math.degrees(math.asin(0.15))) & (
-        off < math.radians(95.0) + 1e-6
-    )
+    rays = np.nan_to_num(rays_of_fisheye(lens))
+    cosine: Any = rays @ towards
+    seen = (cosine > math.cos(math.asin(0.15))) & rays.any(axis=-1)
     ball_range = 10.0 * cosine - np.sqrt(np.maximum(1.5**2 - 100.0 * (1.0 - cosine**2), 0.0))
     mine: Any = picture.seen == OBSTACLE
     edge: Any = np.abs(np.arccos(cosine) - math.asin(0.15)) < 1e-5
@@ -91,9 +95,12 @@ def test_points_fall_where_the_rays_begin() -> None:
     assert not np.isfinite(behind).any()
 
 
-def test_a_pixel_shows_what_a_pinhole_shows_that_looks_along_its_ray() -> None:
+@pytest.mark.parametrize("distortion", [UNDISTORTED, BARREL])
+def test_a_pixel_shows_what_a_pinhole_shows_that_looks_along_its_ray(
+    distortion: Distortion,
+) -> None:
     """Depth, colours, shadows and textures: a small pinhole of the same pixels, turned there."""
-    k = Intrinsics.from_fov(64, 48, math.radians(150.0), "fisheye")
+    k = Intrinsics.from_fov(64, 48, math.radians(150.0), "fisheye", distortion=distortion)
     small = Intrinsics(3, 3, k.focal, 1.0, 1.0)
     rays, rng = fisheye_rays(k), np.random.default_rng(2)
     scene = replace(arena(busy(1), sun=sun(200.0, 40.0)), appearance=DEFAULT)
@@ -117,9 +124,10 @@ def test_a_pixel_shows_what_a_pinhole_shows_that_looks_along_its_ray() -> None:
     assert same > 0.97 * total
 
 
-def test_an_image_from_elsewhere_is_that_of_the_camera_there() -> None:
+@pytest.mark.parametrize("distortion", [UNDISTORTED, BARREL, OPENING])
+def test_an_image_from_elsewhere_is_that_of_the_camera_there(distortion: Distortion) -> None:
     camera = load_vehicle("quad").camera.model_copy(update={"projection": "fisheye"})
-    k = Intrinsics.from_fov(64, 48, math.radians(180.0), "fisheye")
+    k = Intrinsics.from_fov(64, 48, math.radians(180.0), "fisheye", distortion=distortion)
     scene, there = arena(busy(2)), np.array([0.3, 0.1, -2.05])
     centers = scene.obstacles.center
     turned = quat_from_euler(0.0, 0.0, 0.1)
@@ -137,11 +145,12 @@ def test_an_image_from_elsewhere_is_that_of_the_camera_there() -> None:
     assert np.abs(first[both].astype(float) - wanted[both]).mean() / 1e3 > 2.0 * off_m.mean()
 
 
-def test_greedy_takes_returns_for_the_points_that_they_are() -> None:
-    scene = ball(80.0, 0.0, 6.0, 0.5)
-    depth = depth_to_z16(render(scene, scene.obstacles.center, WIDE, 5.9, HERE, LEVEL))
+@pytest.mark.parametrize("distortion", [UNDISTORTED, BARREL, OPENING])
+def test_greedy_takes_returns_for_the_points_that_they_are(distortion: Distortion) -> None:
+    scene, lens = ball(80.0, 0.0, 6.0, 0.5), wide(distortion)
+    depth = depth_to_z16(render(scene, scene.obstacles.center, lens, 5.9, HERE, LEVEL))
     state = Kinematics(HERE, np.zeros(3), LEVEL)
-    seen = observe(depth, WIDE, state, np.array([9.0, 0.0]))
+    seen = observe(depth, lens, state, np.array([9.0, 0.0]))
     points = near_points(seen, 0.4)
     apart = np.linalg.norm(points - (scene.obstacles.center[0] - HERE)[:2], axis=1)
     assert len(points) > 10
@@ -161,10 +170,6 @@ def test_the_card_tells_a_fisheye_from_a_cylinder_of_the_same_size() -> None:
 
 
 def test_what_it_does_not_see_is_refused() -> None:
-    scene = ball(0.0, 0.0, 5.0, 1.0)
-    mesh = PlacedMesh(MeshFile(file="x", sha256="0" * 64), (0.0, 0.0), 0.0, 1.0, 0, 1)
-    with pytest.raises(UsageError, match="a fisheye sees no meshes; accepted: a pinhole"):
-        check_meshes(WIDE, replace(scene, meshes=(mesh,)))
     with pytest.raises(FieldError, match="value <= 190 deg with 'fisheye'"):
         type(load_vehicle("quad").camera).model_validate(
             {

@@ -18,8 +18,10 @@ from airl_mav.camera.primitives import FLOOR, OBSTACLE, SKY
 from airl_mav.camera.render import Motion, Mount
 from airl_mav.core.frames import quat_from_euler, quat_to_matrix
 from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.profiles.distortion import UNDISTORTED, Distortion
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.projection import PROJECTIONS, Projection
+from tests.support.lenses import BARREL, OPENING, published
 from tests.unit.test_colour import rays_of
 
 FOV = {"pinhole": 1.6, "cylindrical": 2.0 * math.pi, "fisheye": math.radians(190.0)}
@@ -38,8 +40,8 @@ def places(k: Intrinsics, p: np.ndarray) -> np.ndarray:
     if k.projection == "cylindrical":
         return np.stack([k.focal * np.arctan2(x, z), k.focal * y / np.hypot(x, z)], 1)
     off = np.arccos(z / np.linalg.norm(p, axis=1))
-    plane = np.arctan2(y, x)
-    return k.focal * off[:, None] * np.stack([np.cos(plane), np.sin(plane)], 1)
+    plane, out = np.arctan2(y, x), published(off, k.distortion)
+    return k.focal * out[:, None] * np.stack([np.cos(plane), np.sin(plane)], 1)
 
 
 def followed(
@@ -66,10 +68,15 @@ def followed(
     return (apart / (2.0 * STEP_S)).reshape(k.height, k.width, 2)
 
 
-@pytest.mark.parametrize("projection", PROJECTIONS)
-def test_flow_is_that_of_points_that_are_followed(projection: Projection) -> None:
+@pytest.mark.parametrize(
+    ("projection", "distortion"),
+    [*((each, UNDISTORTED) for each in PROJECTIONS), ("fisheye", BARREL), ("fisheye", OPENING)],
+)
+def test_flow_is_that_of_points_that_are_followed(
+    projection: Projection, distortion: Distortion
+) -> None:
     """From a vehicle that flies and turns, among obstacles that move."""
-    k, rng = lens_of(projection), np.random.default_rng(6)
+    k, rng = replace(lens_of(projection), distortion=distortion), np.random.default_rng(6)
     spec = load_profile("arenas", "dynamic-obstacles", ArenaSpec)
     shown = {SKY: 0, FLOOR: 0}
     moving = 0

@@ -15,6 +15,7 @@ from airl_mav.camera.frame import LEAST_PX, MAX_MM, MOST_PX, Frame, FrameError, 
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.errors import UsageError
 from airl_mav.profiles.camera_kind import KINDS, CameraKind
+from airl_mav.profiles.distortion import MOST_COEFFICIENT, UNDISTORTED
 from airl_mav.profiles.projection import PROJECTIONS, Projection
 
 lengths = st.floats(-MOST_PX, MOST_PX)
@@ -28,7 +29,11 @@ def frames(draw: st.DrawFn) -> Frame:
     if projection == "cylindrical":
         focal = max(focal, width / (2.0 * math.pi))
     kind = draw(st.sampled_from(KINDS))
-    k = Intrinsics(width, height, focal, draw(lengths), draw(lengths), projection, kind)
+    some = st.floats(-MOST_COEFFICIENT, MOST_COEFFICIENT)
+    bent = st.just(UNDISTORTED) | st.tuples(some, some, some, some)
+    distortion = draw(bent) if projection == "fisheye" else UNDISTORTED
+    place = draw(lengths), draw(lengths)
+    k = Intrinsics(width, height, focal, *place, projection, kind, distortion)
     image = draw(arrays(k.dtype, k.shape))
     sequence = draw(st.integers(0, 2**64 - 1))
     return Frame(sequence, draw(st.integers(-(2**63), 2**63 - 1)), image, k)

@@ -22,7 +22,9 @@ from airl_mav.camera.render import render
 from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import quat_from_euler, quat_to_matrix
 from airl_mav.profiles.appearance import Appearance
-from airl_mav.profiles.projection import Projection
+from airl_mav.profiles.distortion import UNDISTORTED, sees_to
+from airl_mav.profiles.projection import PROJECTIONS, Projection
+from tests.support.lenses import BARREL, ENDING, OPENING, rays_of_fisheye
 from tests.support.meshes import ROOM, kept, ring, scene_of, triangles
 
 Floats = NDArray[np.float64]
@@ -46,12 +48,22 @@ def in_world(arena: Arena) -> Floats:
 
 
 def rays_of(k: Intrinsics, quaternion: Floats) -> Floats:
-    """Return the ray (h w, 3) of each pixel, NED, of the length 1 in depth."""
+    """Return the ray (h w, 3) of each pixel, NED, of the length 1 in depth; 0: it sees nothing."""
     v, u = np.mgrid[: k.height, : k.width].reshape(2, -1)
     x, y = (u - k.cx) / k.focal, (v - k.cy) / k.focal
     ahead, right = (np.cos(x), np.sin(x)) if k.cylindrical else (np.ones(len(x)), x)
-    rays: Floats = np.stack([ahead, right, y], axis=1) @ quat_to_matrix(quaternion).T
+    own = np.stack([ahead, right, y], axis=1)
+    if k.projection == "fisheye":
+        own = np.nan_to_num(rays_of_fisheye(k).reshape(-1, 3))
+    rays: Floats = own @ quat_to_matrix(quaternion).T
     return rays
+
+
+def fisheye(side: int, number: int) -> Intrinsics:
+    """Return one of a few lenses, whose circle ends within the image or beyond it."""
+    k = (UNDISTORTED, BARREL, OPENING, ENDING)[number % 4]
+    fov = 2.0 * sees_to(k) * (1.0 if number % 3 else 0.7)
+    return Intrinsics.from_fov(side, side, fov, "fisheye", distortion=k)
 
 
 def nearest(origins: Floats, rays: Floats, corners: Floats, least: float = 0.0) -> Floats:
@@ -90,7 +102,7 @@ def pose_in(rng: np.random.Generator, arena: Arena) -> tuple[Floats, Floats]:
 
 
 @pytest.mark.timeout(600)  # compiles kernels, on a busy machine for minutes
-@pytest.mark.parametrize("projection", ["pinhole", "cylindrical"])
+@pytest.mark.parametrize("projection", PROJECTIONS)
 def test_depth_is_that_of_rays_in_float64(projection: Projection, tmp_path: Path) -> None:
     file = kept(triangles(ring()), tmp_path / "ring.npz")
     rng = np.random.default_rng(3)
@@ -102,6 +114,8 @@ def test_depth_is_that_of_rays_in_float64(projection: Projection, tmp_path: Path
         )
         fov = rng.uniform(0.6, 2.4) if projection == "pinhole" else 2.0 * math.pi
         k = Intrinsics.from_fov(33, 25, fov, projection)
+        if projection == "fisheye":
+            k = fisheye(33, view)
         pose = pose_in(rng, arena)
         range_m = math.inf if view % 2 else 9.0
         seen = render(arena, arena.obstacles.center, k, range_m, *pose).astype(np.float64)
@@ -143,7 +157,8 @@ def test_no_ray_passes_between_triangles(tmp_path: Path) -> None:
 
 
 @pytest.mark.timeout(600)  # compiles kernels, on a busy machine for minutes
-def test_a_mesh_of_a_box_is_the_box(tmp_path: Path) -> None:
+@pytest.mark.parametrize("projection", PROJECTIONS)
+def test_a_mesh_of_a_box_is_the_box(projection: Projection, tmp_path: Path) -> None:
     half = np.array([0.6, 0.9, 0.75])
     file = kept(triangles(trimesh.creation.box(2.0 * half)), tmp_path / "box.npz")
     plain = {"floor": "gravel", "walls": "brick", "static": "orange"}
@@ -151,7 +166,9 @@ def test_a_mesh_of_a_box_is_the_box(tmp_path: Path) -> None:
         {name: {"materials": [material]} for name, material in plain.items()}
     )
     rng = np.random.default_rng(5)
-    k = Intrinsics.from_fov(64, 48, 1.4)
+    k = Intrinsics.from_fov(64, 48, 1.4, projection)
+    if projection == "fisheye":
+        k = Intrinsics.from_fov(64, 48, 2.4, projection, distortion=BARREL)
     shaded = 0
     for seed in range(6):
         n = 5
@@ -176,7 +193,8 @@ def test_a_mesh_of_a_box_is_the_box(tmp_path: Path) -> None:
     assert shaded > 1000
 
 
-def test_shadows_are_those_of_rays_in_float64(tmp_path: Path) -> None:
+@pytest.mark.parametrize("projection", ["pinhole", "fisheye"])
+def test_shadows_are_those_of_rays_in_float64(projection: Projection, tmp_path: Path) -> None:
     file = kept(triangles(ring()), tmp_path / "ring.npz")
     # White surfaces under a sun alone: what is dark is in shadow or turned away.
     # A black floor throws no light onto the meshes.
@@ -195,6 +213,8 @@ def test_shadows_are_those_of_rays_in_float64(tmp_path: Path) -> None:
     ]
     rng = np.random.default_rng(8)
     k = Intrinsics.from_fov(48, 36, 1.3)
+    if projection == "fisheye":
+        k = Intrinsics.from_fov(48, 36, 1.7, projection, distortion=OPENING)
     own = floor = 0
     for seed in range(4):
         arena = scene_of(file, [(0.0, 0.0, rng.uniform(-3, 3), 2.0), (3.0, -2.0, 0.4, 1.3)])

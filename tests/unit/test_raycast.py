@@ -24,7 +24,9 @@ from airl_mav.core.frames import (
     quat_multiply,
     quat_to_matrix,
 )
+from airl_mav.profiles.distortion import UNDISTORTED, sees_to
 from airl_mav.profiles.projection import PROJECTIONS, Projection
+from tests.support.lenses import BARREL, ENDING, OPENING, rays_of_fisheye
 
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 RIGHT_ANGLE = Intrinsics.from_fov(33, 25, math.pi / 2)  # odd: the centre pixel is the optical axis
@@ -96,10 +98,7 @@ class Rays:
         ahead, right = (np.cos(x), np.sin(x)) if k.projection == "cylindrical" else (x**0, x)
         camera = np.stack([ahead, right, y], -1)
         if k.projection == "fisheye":
-            off, plane = np.hypot(x, y), np.arctan2(y, x)
-            aside = np.sin(off)
-            camera = np.stack([np.cos(off), aside * np.cos(plane), aside * np.sin(plane)], -1)
-            camera[off > math.radians(95.0)] = math.nan
+            camera = rays_of_fisheye(k)
         attitude = Rotation.from_quat(np.roll(scene.quaternion, -1)).as_matrix()
         self.d = camera.reshape(-1, 3) @ attitude.T
         self.o = np.array([*scene.position[:2], min(scene.position[2], -MIN_DEPTH_M)])
@@ -236,8 +235,9 @@ def test_agrees_with_brute_force(projection: Projection, seed: int) -> None:
         if projection == "cylindrical":
             scene = all_round(scene, rng)
         elif projection == "fisheye":
-            k, fov = scene.intrinsics, rng.uniform(0.4, math.radians(190.0))
-            lens = Intrinsics.from_fov(k.width, k.height, fov, "fisheye")
+            k, bent = scene.intrinsics, (UNDISTORTED, BARREL, OPENING, ENDING)[number % 4]
+            fov = rng.uniform(0.4, 2.0 * sees_to(bent))
+            lens = Intrinsics.from_fov(k.width, k.height, fov, "fisheye", distortion=bent)
             scene = replace(scene, intrinsics=lens)
         depth, expected = scene.render(), brute_force(scene)[0]
         error = float(np.max(np.abs(depth - expected)))

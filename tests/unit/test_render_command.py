@@ -20,6 +20,7 @@ from airl_mav.core.frames import quat_from_euler
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.report.depth_colours import coloured
+from tests.support.lenses import BARREL
 
 SMALL = ("--width-px", "64", "--height-px", "48")
 POSE = ("--north-m", "8", "--east-m", "-2", "--height-m", "3", "--yaw-deg", "20")
@@ -44,6 +45,20 @@ def sensor(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     place = np.array([8.0, -2.0, -3.0])
     picture = render_picture(arena, arena.centers_at(0), camera, place, attitude)
     return picture.rgb, picture.depth_m, picture.seen
+
+
+def test_a_fisheye_has_its_coefficients(tmp_path: Path) -> None:
+    words = ("--projection", "fisheye", "--fov-deg", "160", "--samples", "1", *POSE, *SMALL)
+    told = ("--distortion", "-0.05", "0.008", "-0.0045", "0.0004")
+    picture = render(tmp_path, "dense-obstacles", "--seed", "5", *words, *told)
+    spec = load_profile("arenas", "dense-obstacles", ArenaSpec)
+    arena = generate(spec, 5, name="x", vehicle_width_m=0.55)
+    camera = Intrinsics.from_fov(64, 48, math.radians(160.0), "fisheye", distortion=BARREL)
+    attitude, place = quat_from_euler(0.0, 0.0, math.radians(20.0)), np.array([8.0, -2.0, -3.0])
+    expected = render_picture(arena, arena.centers_at(0), camera, place, attitude).rgb
+    np.testing.assert_array_equal(picture, expected)
+    with pytest.raises(UsageError, match=r"--distortion.*left out with projection 'pinhole'"):
+        render(tmp_path, *told)
 
 
 def test_one_ray_a_pixel_is_what_the_sensor_sees(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -45,6 +46,7 @@ def image_of(pixels: NDArray[Any], encoding: str, **more: Any) -> SimpleNamespac
 
 def info_of(**more: Any) -> SimpleNamespace:
     fields = {"width": 80, "height": 60, "d": [0.0] * 5, "k": K, "p": P}
+    fields["distortion_model"] = "plumb_bob"
     fields |= {"binning_x": 0, "binning_y": 1, "roi": SimpleNamespace(width=0, height=0)}
     return SimpleNamespace(**{**fields, **more})
 
@@ -94,6 +96,13 @@ def test_a_lens_is_that_of_the_images_that_are_sent() -> None:
     assert lens_of(info_of(d=[])) == LENS
     # With distortion only its rectified images are a pinhole's, and P describes those.
     assert lens_of(info_of(d=[0.1, 0.0])) == Lens(80, 60, 50.0, 51.0, 40.0, 30.0)
+    # A fisheye's own images are described by K and D, its rectified ones by P.
+    bent = info_of(d=[-0.05, 0.008, -0.004, 0.0], distortion_model="equidistant")
+    assert lens_of(bent, "/wide/depth/image_raw") == replace(
+        LENS, distortion=(-0.05, 0.008, -0.004, 0.0)
+    )
+    rectified = Lens(80, 60, 50.0, 51.0, 40.0, 30.0)
+    assert lens_of(bent, "/rect/depth/image_rect_raw") == rectified
     whole = SimpleNamespace(width=80, height=60)
     assert lens_of(info_of(roi=whole)) == LENS
 
@@ -103,11 +112,13 @@ def test_a_lens_is_that_of_the_images_that_are_sent() -> None:
     [
         ({"k": (0.0,) * 9}, "no pinhole"),
         ({"k": (np.nan,) * 9}, "no pinhole"),
+        ({"d": [0.1], "distortion_model": "equidistant"}, "accepted: four numbers from -100"),
+        ({"d": [0.1, 0, 0, np.nan], "distortion_model": "equidistant"}, "accepted: four"),
         ({"binning_x": 2}, "binned or cropped"),
         ({"roi": SimpleNamespace(width=40, height=60)}, "binned or cropped"),
     ],
 )
-def test_what_describes_no_pinhole_is_refused(change: dict[str, Any], problem: str) -> None:
+def test_what_describes_no_camera_of_ours_is_refused(change: dict[str, Any], problem: str) -> None:
     with pytest.raises(ValueError, match=problem):
         lens_of(info_of(**change))
 

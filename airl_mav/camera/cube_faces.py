@@ -1,0 +1,134 @@
+"""An image with any rays, resampled from pinhole images of the faces of a cube about the camera.
+
+For renderers that have pinholes alone. A pixel is divided into `side` x `side` places; each has a
+ray, which leaves the cube through one face, and takes what the nearest pixel of that face shows.
+Only faces, and of them only the rectangles, that a ray goes through are rendered.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.rays import finer, rays_of
+from airl_mav.profiles.distortion import sees_to, steepness
+
+Floats = NDArray[np.float64]
+
+FACES = tuple((axis, sign) for axis in range(3) for sign in (1.0, -1.0))
+"""Axis of the camera (forward, right, down) that a face lies across, and to which side."""
+
+MOST_SIDE = 4
+"""A pixel is divided into so many places a side, at most."""
+
+MOST_PLACES = 1 << 24
+"""Places of an image, at most: each takes some hundred bytes while they are found."""
+
+
+class Face(NamedTuple):
+    """One face of the cube: the axes of its image, and which part of it is rendered."""
+
+    axes: Floats
+    """(3, 3) rows forward, right, down of the face's own camera, in the camera's axes forward,
+    right, down."""
+    pixels: int
+    """Of its whole image, a pinhole of 90 degrees, along each side."""
+    left: int
+    top: int
+    width: int
+    height: int
+    places: NDArray[np.intp]
+    """(n,) numbers of the places (h side, w side), flattened, that look through this face."""
+    source: NDArray[np.intp]
+    """(n,) the pixel of the rendered part, flattened, that each of them sees."""
+
+
+class Cube(NamedTuple):
+    """How an image is made of faces."""
+
+    shape: tuple[int, int]
+    """Rows and columns of the image."""
+    side: int
+    faces: tuple[Face, ...]
+    """Those that are needed."""
+
+
+def side_for(camera: Intrinsics, samples: int) -> int:
+    """Return into how many places a side a pixel of so many samples is divided."""
+    side = min(MOST_SIDE, math.isqrt(samples))
+    while side > 1 and side * side * camera.width * camera.height > MOST_PLACES:
+        side -= 1
+    return side
+
+
+def cube_of(camera: Intrinsics, side: int) -> Cube:
+    """Return the faces that a camera's image is made of, with side x side places a pixel.
+
+    A face is in its middle, where it is coarsest, as fine as the image so divided is outwards from
+    its own middle, where that is finest. Around its middle a fisheye's image is finer, by half at
+    90 degrees.
+    """
+    k, fine = camera, finer(camera, side)
+    rays = rays_of(fine)
+    # A pixel that sees nothing is black as a whole.
+    blind = ~rays_of(k).any(axis=0)
+    rays[:, np.repeat(np.repeat(blind, side, axis=0), side, axis=1)] = 0.0
+    rays = rays.reshape(3, -1)
+    pixels = 2 * math.ceil(fine.focal * _finest(k))
+    across = np.abs(rays).argmax(axis=0)
+    sees = rays.any(axis=0)
+    faces = []
+    for axis, sign in FACES:
+        places = np.flatnonzero(sees & (across == axis) & (sign * rays[axis] > 0.0))
+        if len(places):
+            faces.append(_face(rays[:, places], places, axis, sign, pixels))
+    return Cube((k.height, k.width), side, tuple(faces))
+
+
+def resampled(cube: Cube, images: list[Floats]) -> Floats:
+    """Return the image (h, w, channels) of the rendered parts (height, width, channels) of faces.
+
+    Each pixel is the mean of its places that see anything, in the order of `Cube.faces`; 0: none.
+    """
+    height, width = cube.shape
+    side, channels = cube.side, images[0].shape[-1] if images else 3
+    light = np.zeros((height * side * width * side, channels))
+    seen = np.zeros(len(light))
+    for face, image in zip(cube.faces, images, strict=True):
+        light[face.places] = image.reshape(-1, channels)[face.source]
+        seen[face.places] = 1.0
+    blocks = (height, side, width, side)
+    total = light.reshape(*blocks, channels).sum(axis=(1, 3))
+    count = seen.reshape(blocks).sum(axis=(1, 3))
+    mean: Floats = total / np.maximum(count, 1.0)[..., None]
+    return mean
+
+
+def _finest(k: Intrinsics) -> float:
+    """Return the most pixels that an image has on an angle, in shares of its focal length."""
+    if k.projection != "fisheye":
+        return 1.0
+    angles = np.linspace(0.0, min(0.5 * k.horizontal_fov_rad, sees_to(k.distortion)), 65)
+    return float(np.max(steepness(angles, k.distortion)))
+
+
+def _face(rays: Floats, places: NDArray[np.intp], axis: int, sign: float, pixels: int) -> Face:
+    """Return the face that rays (3, n), of these places, go through."""
+    forward, right = np.zeros(3), np.zeros(3)
+    forward[axis] = sign
+    # Any turn about its own axis will do.
+    right[(axis + 1) % 3] = 1.0
+    axes = np.stack([forward, right, np.cross(forward, right)])
+    ahead, aside, below = axes @ rays
+    column, row = (
+        np.clip(((0.5 + 0.5 * part / ahead) * pixels).astype(np.intp), 0, pixels - 1)
+        for part in (aside, below)
+    )
+    left, top = int(column.min()), int(row.min())
+    width, height = int(column.max()) - left + 1, int(row.max()) - top + 1
+    source = (row - top) * width + column - left
+    return Face(axes, pixels, left, top, width, height, places, source)

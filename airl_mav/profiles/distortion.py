@@ -1,0 +1,146 @@
+"""The coefficients of a fisheye: at which angle off the axis a place of the image is seen.
+
+The model of Kannala and Brandt ("A generic camera model and calibration method for conventional,
+wide-angle, and fish-eye lenses", 2006) as OpenCV's `fisheye` and ROS's `equidistant` have it: what
+is seen at an angle theta [rad] from the optical axis falls at the way r = focal theta_d from its
+place in the image, with
+
+    theta_d = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8).
+
+With all coefficients 0 it is the equidistant lens, r = focal theta. A lens sees as far as theta_d
+increases, to 95 degrees at most.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from itertools import pairwise
+from typing import Any, Final, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.core.errors import FieldError
+from airl_mav.profiles.projection import FISHEYE_MOST_DEG, Projection
+
+Distortion = tuple[float, float, float, float]
+"""k1, k2, k3, k4."""
+
+UNDISTORTED: Final[Distortion] = (0.0, 0.0, 0.0, 0.0)
+"""An equidistant lens."""
+
+MOST_OFF_RAD: Final = math.radians(0.5 * FISHEYE_MOST_DEG)
+"""What is farther from the optical axis falls on no pixel of any lens [rad]."""
+
+_MOST_STEPS: Final = 100
+"""Bisection alone comes to rounding in fewer."""
+
+_ROUNDING: Final = 1e-12
+"""Share of theta_d by which rounding may move the rim of a lens."""
+
+MOST_COEFFICIENT: Final = 100.0
+"""Greatest amount of a coefficient; those of real lenses are below 10."""
+
+Angle = TypeVar("Angle", float, NDArray[Any])
+
+
+def distorted(theta: Angle, k: Distortion) -> Angle:
+    """Return theta_d [rad] of angles from the optical axis [rad]; kernels compile it, too."""
+    square = theta * theta
+    part = k[1] + square * (k[2] + square * k[3])
+    found: Angle = theta * (1.0 + square * (k[0] + square * part))
+    return found
+
+
+def steepness(theta: Angle, k: Distortion) -> Angle:
+    """Return the derivative of theta_d by theta at angles from the optical axis [rad]."""
+    square = theta * theta
+    part = 5.0 * k[1] + square * (7.0 * k[2] + square * (9.0 * k[3]))
+    found: Angle = 1.0 + square * (3.0 * k[0] + square * part)
+    return found
+
+
+@lru_cache(maxsize=256)
+def sees_to(k: Distortion) -> float:
+    """Return the angle from the optical axis [rad] to which theta_d increases; at most 95 deg."""
+    by_square = [1.0, 3.0 * k[0], 5.0 * k[1], 7.0 * k[2], 9.0 * k[3]]
+    turns = _crossings(by_square, MOST_OFF_RAD * MOST_OFF_RAD)
+    return math.sqrt(turns[0]) if turns else MOST_OFF_RAD
+
+
+def undistorted(theta_d: NDArray[Any], k: Distortion) -> NDArray[np.float64]:
+    """Return the angles from the optical axis [rad] that fall at theta_d >= 0, to rounding.
+
+    Newton's method, kept between bounds that close in; infinity where no angle falls that far out.
+    """
+    aim = np.asarray(theta_d, np.float64)
+    if k == UNDISTORTED:
+        return np.where(aim > MOST_OFF_RAD + 1e-9, np.inf, aim)
+    most = sees_to(k)
+    rim = distorted(most, k)
+    low, high = np.zeros(aim.shape), np.full(aim.shape, most)
+    theta = np.minimum(aim, most)
+    for _ in range(_MOST_STEPS):
+        beyond = distorted(theta, k) - aim
+        low, high = np.where(beyond <= 0.0, theta, low), np.where(beyond >= 0.0, theta, high)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            newer = theta - beyond / steepness(theta, k)
+        newer = np.where((newer >= low) & (newer <= high), newer, 0.5 * (low + high))
+        moved = np.abs(newer - theta)
+        theta = newer
+        if (moved <= 2.0 * np.spacing(theta)).all():
+            break
+    return np.where(aim > rim * (1.0 + _ROUNDING), np.inf, theta)
+
+
+def check_distortion(
+    field: str, projection: Projection, horizontal_fov_deg: float, k: Distortion
+) -> None:
+    """Raise FieldError, of this name, for coefficients that a camera cannot have."""
+    if k == UNDISTORTED:
+        return
+    shown = [float(each) for each in k]
+    if projection != "fisheye":
+        raise FieldError(
+            field, shown, f"left out with projection {projection!r}, only of a fisheye"
+        )
+    reached_deg, half_deg = math.degrees(sees_to(k)), 0.5 * horizontal_fov_deg
+    if reached_deg < half_deg:
+        raise FieldError(
+            field,
+            shown,
+            "coefficients with which theta_d increases over the whole field of view, to"
+            f" {half_deg:g} deg from the axis; with these it does to {reached_deg:.4g} deg",
+        )
+
+
+def _crossings(polynomial: list[float], end: float) -> list[float]:
+    """Return where a polynomial, lowest power first, changes its sign between 0 and an end.
+
+    Between two places where its derivative changes its own it does so once at most.
+    """
+    if len(polynomial) == 1:
+        return []
+    slope = [power * factor for power, factor in enumerate(polynomial)][1:]
+    found = []
+    for first, last in pairwise([0.0, *_crossings(slope, end), end]):
+        low, high = first, last
+        rises = _value(polynomial, high) > 0.0
+        if (_value(polynomial, low) > 0.0) == rises:
+            continue
+        while low < (middle := 0.5 * (low + high)) < high:
+            if (_value(polynomial, middle) > 0.0) == rises:
+                high = middle
+            else:
+                low = middle
+        found.append(low)
+    return found
+
+
+def _value(polynomial: list[float], x: float) -> float:
+    """Return the value of a polynomial, lowest power first."""
+    value = 0.0
+    for factor in reversed(polynomial):
+        value = value * x + factor
+    return value
