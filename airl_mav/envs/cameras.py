@@ -156,6 +156,11 @@ class Cameras(Stateful):
             for name, each in (further or {}).items()
         }
         """Those that are triggered with the main one, by name."""
+        tables = [each.imaging for each in (camera, *(further or {}).values())]
+        self.exposed_in_motion = any(
+            table is not None and (table.exposure_ms or table.readout_ms) for table in tables
+        )
+        """Whether any image depends on how its vehicle moves when it is taken."""
         self.period_us = camera.period_us
         self.transport_us = transport_us
         self._first_us = np.zeros(n, np.int64)

@@ -442,6 +442,8 @@ class Navigation(Stateful):
     def advance_in_legs(self, ticks: NDArray[np.int64], setpoints: NDArray[np.float64]) -> bool:
         """Fly all flights in three legs, if they can be; see `timing.Vehicles`."""
         watched = self._trace is not None or self.cameras.may_freeze
+        # Between legs only places and attitudes are kept, not how the vehicles move.
+        watched |= self.cameras.exposed_in_motion
         if watched or not self._winds.calm or not ticks[:, 0].all():
             return False
         fleet = self.fleet
