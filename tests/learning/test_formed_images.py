@@ -82,7 +82,7 @@ def test_an_image_is_exposed_with_the_motion_of_its_moment(tmp_path: Path, imagi
         for _ in range(3):
             env.fly(np.array([[4.0, 0.0, 0.9], [2.0, 1.0, -0.7]]))
         images.append(env.cameras.image.copy())
-    np.testing.assert_array_equal(*images)
+    np.testing.assert_array_equal(images[0], images[1])
 
 
 def test_noise_is_that_of_the_frame_s_number(tmp_path: Path) -> None:
