@@ -33,7 +33,7 @@ from airl_mav.training.onnx_export import (
     random_inputs,
     random_memory,
 )
-from airl_mav.training.recurrent import RecurrentNetwork
+from airl_mav.training.recurrent import RecurrentNetwork, RecurrentOfSeveral
 
 DEPTH = "depth"
 """Key of the image where the camera gives depth."""
@@ -170,13 +170,15 @@ def network_of(model: BaseAlgorithm) -> nn.Module:
         hidden = policy.mlp_extractor.policy_net
         extractor = policy.pi_features_extractor
         if hasattr(policy, "lstm_actor"):
-            if not usual:
+            several = bool(further) and set(keys) == {image, *VECTORS, *further}
+            if not (usual or several):
                 raise UsageError(
                     f"a network with a memory of its own takes {', '.join(keys)}; accepted:"
                     f" {', '.join((image, *VECTORS))}"
                 )
             head = nn.Sequential(hidden, policy.action_net, last)
-            return RecurrentNetwork(_Actor(policy, extractor), policy.lstm_actor, head, image)
+            parts = (_Actor(policy, extractor), policy.lstm_actor, head, image)
+            return RecurrentOfSeveral(*parts, further) if several else RecurrentNetwork(*parts)
         return network(_Actor(policy, extractor, hidden, policy.action_net, last))
     raise UsageError(f"{type(model).__name__}: its {type(policy).__name__} cannot be exported")
 
