@@ -107,9 +107,7 @@ class RecurrentOfSeveral(RecurrentNetwork):
         super().__init__(features, lstm, head, image)
         self.keys = (image, VELOCITY, GOAL, *further)
 
-    def forward(  # type: ignore[override]
-        self, *arrays: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def forward(self, *arrays: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Return the outputs (n, k), and hidden and cell (n, layers, units) after the decision."""
         *seen, hidden, cell = arrays
         return self.decided(dict(zip(self.keys, seen, strict=True)), hidden, cell)
