@@ -16,6 +16,7 @@ from typing import Any, Protocol
 
 import psutil
 
+from airl_mav.black_box.channels import encoded
 from airl_mav.black_box.messages import (
     SUFFIX,
     WARNING,
@@ -209,7 +210,12 @@ class BlackBoxRecorder:
         if told.started_us >= self._next_image_us:
             self._next_image_us = told.started_us + self._image_us
             seen_us = told.seen.received_us
-            self._write(image_message(frame.image, self._unix_us + seen_us), told.sent_us)
+            taken_us, sent_us = self._unix_us + seen_us, told.sent_us
+            self._write(image_message(frame.image, taken_us), sent_us)
+            for name, each in frame.further.items():
+                channel, data = encoded(image_message(each.image, taken_us, name))
+                channel = channel._replace(topic=f"{channel.topic}/{name}")
+                self._file.add(channel, data, self._unix_us + sent_us)
 
     def _status(self, now_us: int) -> Status:
         status, battery = self._link.status(), self._link.battery()

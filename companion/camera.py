@@ -123,8 +123,10 @@ class ZmqFrameSource:
         Whoever flies by its images keeps some of them: they have one size for a whole flight.
         Raises FrameError for one of another size than the first.
         """
-        if self._newest is not None and frame.intrinsics != self._newest.frame.intrinsics:
-            raise FrameError("another camera's frame")
+        if self._newest is not None:
+            known = self._newest.frame
+            if (frame.intrinsics, frame.lenses) != (known.intrinsics, known.lenses):
+                raise FrameError("another camera's frame")
         return frame
 
     def wait(self, newer_than_sequence: int, timeout_s: float) -> ReceivedFrame | None:

@@ -17,7 +17,7 @@ from airl_mav.core.clock import Clock, WallClock
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.cpu_quota import held_to
 from airl_mav.core.errors import UsageError
-from airl_mav.policy.observation import InFlight, Kinematics, observe
+from airl_mav.policy.observation import InFlight, Kinematics, observe, views_of
 from airl_mav.scenario.stand_alone import StandAloneCompanion
 from companion.camera import FrameSource, ReceivedFrame
 from companion.dialects import RATE_HZ
@@ -108,6 +108,8 @@ def look_at_camera(
         return
     kind = "" if lens.kind == "depth" else f"{lens.kind}, "
     told = f"{kind}{lens.width}x{lens.height} px, {rate_hz:.1f} frames/s"
+    for name, other in first.frame.lenses.items():
+        told += f"; {name}: {other.kind}, {other.width}x{other.height} px"
     if frozen:
         # A simulator's image of a vehicle at rest has no noise, so this is no fault by itself.
         told += "; every image is the same (a real camera has noise)"
@@ -156,6 +158,7 @@ def time_decisions(mission: Mission, seen: ReceivedFrame, state: Kinematics) -> 
     observation = observe(
         *(frame.image, frame.intrinsics, state, np.asarray(mission.goal, np.float64)),
         InFlight(told.command[0], told.latency_s[0], told.age_s[0]),
+        further=views_of(frame),
     )
     try:
         for _ in range(DECISIONS + 1):

@@ -123,6 +123,7 @@ class Limits:
         goal: Goal,
         pilot: PilotSettings,
         mount_pitch_up_rad: float = 0.0,
+        mount_yaw_rad: float = 0.0,
     ) -> None:
         """Prepare a flight.
 
@@ -131,11 +132,12 @@ class Limits:
             goal: North, east of the start [m], and down where it has a height.
             pilot: How the policy is flown.
             mount_pitch_up_rad: How far the camera looks up, as it is mounted [rad].
+            mount_yaw_rad: How far it looks to the right of the nose, as it is mounted [rad].
         """
         self.ending: Ending | None = None
         """What has ended the flight."""
         self._vehicle = VehicleLimits(settings, goal, pilot)
-        self._camera = CameraLimits(settings, mount_pitch_up_rad)
+        self._camera = CameraLimits(settings, mount_pitch_up_rad, mount_yaw_rad)
 
     def begin(self, now_us: int) -> None:
         """Navigation begins."""
@@ -277,11 +279,13 @@ class VehicleLimits:
 
 
 class CameraLimits:
-    """Rules for what the camera shows."""
+    """Rules for what the main camera shows; further ones are not looked at."""
 
-    def __init__(self, settings: LimitSettings, mount_pitch_up_rad: float) -> None:
-        """Begin; the camera is mounted looking up by so much."""
-        self._mount_rad = mount_pitch_up_rad
+    def __init__(
+        self, settings: LimitSettings, mount_pitch_up_rad: float, mount_yaw_rad: float
+    ) -> None:
+        """Begin; the camera is mounted looking so far up and to the right of the nose."""
+        self._mount_rad = mount_pitch_up_rad, mount_yaw_rad
         self._silence_us = round(settings.silence_s * US_PER_S)
         self._same_us = round(settings.image_s * US_PER_S)
         self._first: Frame | None = None
@@ -328,7 +332,7 @@ class CameraLimits:
                 CAMERA_FROZEN, f"the image has not changed for {silent_us / US_PER_S:.1f} s"
             )
         blank = even and (frame.intrinsics.kind == "depth" or _dead(image))
-        if not blank or not ground_in_view(frame, state, self._mount_rad):
+        if not blank or not ground_in_view(frame, state, *self._mount_rad):
             self._blank_since_us = None
         elif self._blank_since_us is None:
             self._blank_since_us = now_us
@@ -354,7 +358,9 @@ def _reading(frame: Frame) -> str:
     return f"{numbers} mm" if frame.intrinsics.kind == "depth" else f"{numbers} of 255"
 
 
-def ground_in_view(frame: Frame, state: Kinematics, mount_pitch_up_rad: float) -> bool:
+def ground_in_view(
+    frame: Frame, state: Kinematics, mount_pitch_up_rad: float, mount_yaw_rad: float = 0.0
+) -> bool:
     """Return whether a camera must see the ground, taken to be as high as the start.
 
     It must where the ray through the middle of the bottom row meets it within `GROUND_M`. Ahead, a
@@ -367,7 +373,10 @@ def ground_in_view(frame: Frame, state: Kinematics, mount_pitch_up_rad: float) -
         # Infinite where the image is higher than the lens's circle: that row sees nothing.
         below_rad = min(float(undistorted(edge, lens.distortion)), sees_to(lens.distortion))
     w, x, y, z = state.quaternion
-    pitch_rad = math.asin(min(1.0, max(-1.0, 2.0 * (w * y - z * x))))
+    # How far the body's direction below the optical axis rises: ahead, it is the pitch.
+    ahead, aside = 2.0 * (w * y - z * x), -2.0 * (y * z + w * x)
+    rise = ahead * math.cos(mount_yaw_rad) + aside * math.sin(mount_yaw_rad)
+    pitch_rad = math.asin(min(1.0, max(-1.0, rise)))
     down_rad = below_rad - pitch_rad - mount_pitch_up_rad
     height_m = -float(state.position[2])
     return down_rad > GRAZING_RAD and 0.0 < height_m < GROUND_M * math.sin(down_rad)

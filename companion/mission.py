@@ -14,7 +14,7 @@ from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.goals import Goal
 from airl_mav.latency.samplers import LatencySampler
 from airl_mav.latency.stamps import DecisionLog
-from airl_mav.policy.actions import CameraBound, Policy
+from airl_mav.policy.actions import CameraBound, Policy, RigBound
 from airl_mav.prediction.compensator import Compensator
 from airl_mav.scenario.model import LimitSettings, PilotSettings, WatchdogSettings
 from airl_mav.scenario.stand_alone import Start
@@ -65,6 +65,7 @@ def fly_mission(
     latency: LatencySampler | None = None,
     compensator: Compensator | None = None,
     mount_pitch_up_rad: float = 0.0,
+    mount_yaw_rad: float = 0.0,
     start: Start = "arm",
     decided: Callable[[Decided], None] | None = None,
 ) -> MissionResult:
@@ -87,13 +88,14 @@ def fly_mission(
         latency: Where to draw t2 from, to fly as a slower computer.
         compensator: Carries forward what is seen; None: the policy sees what is.
         mount_pitch_up_rad: How far the camera looks up, as it is mounted [rad].
+        mount_yaw_rad: How far it looks to the right of the nose, as it is mounted [rad].
         start: Whether this program arms, takes off and lands, or a pilot who hands the vehicle over
             in flight and gets it back in Hold.
         decided: Told every decision when it is sent; it must return at once.
     """
     watchdog = Watchdog(link, clock, watchdog_settings)
     navigating = False
-    limits = Limits(limit_settings, goal, pilot_settings, mount_pitch_up_rad)
+    limits = Limits(limit_settings, goal, pilot_settings, mount_pitch_up_rad, mount_yaw_rad)
     pilot = Pilot(
         *(link, frames, policy, watchdog, clock, pilot_settings),
         latency=latency,
@@ -204,6 +206,9 @@ def check_camera(
         camera = received.frame.intrinsics
         if isinstance(policy, CameraBound) and (reason := policy.refuses(camera)) is not None:
             raise UsageError(f"--policy {policy.name}: {reason}")
+        lenses = received.frame.lenses
+        if isinstance(policy, RigBound) and (reason := policy.refuses_further(lenses)) is not None:
+            raise UsageError(f"--policy {policy.name}: in the frames that come: {reason}")
         if compensator is not None and camera != compensator.intrinsics:
             raise FieldError(
                 "compensate",

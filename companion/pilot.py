@@ -22,7 +22,7 @@ from airl_mav.core.goals import Goal, goal_distance_m
 from airl_mav.latency.samplers import LatencySampler
 from airl_mav.latency.stamps import NO_STAMP, DecisionLog
 from airl_mav.policy.actions import Policy, limited, vertical_speed
-from airl_mav.policy.observation import InFlight, Kinematics, Observation, observe
+from airl_mav.policy.observation import InFlight, Kinematics, Observation, observe, views_of
 from airl_mav.policy.observation_spec import MOST_FRAMES
 from airl_mav.prediction.compensator import Compensator
 from airl_mav.prediction.memory import DecisionMemory
@@ -90,6 +90,10 @@ class Pilot:
         default_factory=lambda: deque(maxlen=MOST_FRAMES - 1), init=False
     )
     """What the decisions before saw, and in what states, the newest first."""
+    further: deque[dict[str, NDArray[Any]]] = field(
+        default_factory=lambda: deque(maxlen=MOST_FRAMES - 1), init=False
+    )
+    """What further cameras showed them, by name."""
     log: DecisionLog = field(default_factory=DecisionLog, init=False)
     held_us: int = field(default=NO_STAMP, init=False)
     """When the last hold ended."""
@@ -111,6 +115,7 @@ class Pilot:
         if self.limits is not None:
             self.limits.begin(self.clock.time_us())
         self.earlier.clear()
+        self.further.clear()
         if self.compensator is not None:
             self.compensator.begin(0)
         else:
@@ -226,11 +231,14 @@ class Pilot:
             state = Kinematics(states.position[0], states.velocity[0], states.quaternion[0])
         told = self.memory.in_flight(age_us)
         earlier = tuple(self.earlier)
+        views = views_of(frame, self.further)
         self.earlier.appendleft((image, state))
+        self.further.appendleft({name: each.image for name, each in views.items()})
         return observe(
             *(image, frame.intrinsics, state, np.asarray(goal, np.float64)),
             InFlight(told.command[0], told.latency_s[0], told.age_s[0]),
             earlier,
+            views,
         )
 
 

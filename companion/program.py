@@ -20,6 +20,7 @@ from airl_mav.core.provenance import describe_machine
 from airl_mav.flight.setup import Part, Setup
 from airl_mav.latency.samplers import LatencySampler, latency_generator
 from airl_mav.policy.actions import Policy
+from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.policy.registry import camera_refused, find_policy
 from airl_mav.prediction.compensator import Compensator
 from airl_mav.profiles.computer import load_computer
@@ -27,6 +28,7 @@ from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from airl_mav.scenario.model import LimitSettings, PilotSettings, WatchdogSettings
 from airl_mav.scenario.piloting import (
     between_commands,
+    check_compensated,
     check_goal_height,
     check_quota,
     decide_piloting,
@@ -76,6 +78,11 @@ class Mission:
         """How far the camera looks up, as it is mounted [rad]."""
         return math.radians(self.vehicle.camera.pitch_up_deg)
 
+    @property
+    def mount_yaw_rad(self) -> float:
+        """How far it looks to the right of the nose, as it is mounted [rad]."""
+        return math.radians(self.vehicle.camera.yaw_deg)
+
 
 def prepare(asked: StandAloneCompanion) -> Mission:
     """Check all that can be wrong before a connection is opened, and load the policy.
@@ -98,12 +105,16 @@ def prepare(asked: StandAloneCompanion) -> Mission:
     if asked.tell_obstacles and vehicle.camera.projection == "fisheye":
         accepted = "with a vehicle whose camera is a pinhole or a cylinder"
         raise FieldError("tell_obstacles", asked.tell_obstacles, accepted)
+    if asked.tell_obstacles and vehicle.camera.yaw_deg != 0.0:
+        accepted = "with a vehicle whose camera looks ahead (camera.yaw_deg = 0)"
+        raise FieldError("tell_obstacles", asked.tell_obstacles, accepted)
     # What its card says is held against the camera's first frame, before take-off.
-    if policy.card is None and (reason := camera_refused(policy, vehicle.camera)):
+    if policy.card is None and (reason := camera_refused(policy, vehicle)):
         raise FieldError(
             "policy", asked.policy, problem=f"does not fit vehicle {asked.vehicle}: {reason}"
         )
     check_goal_height(policy, asked.goal, "goal", " ".join(f"{metres:g}" for metres in asked.goal))
+    check_compensated(pilot, policy, vehicle)
     if pilot.compensate:
         compensator = Compensator(1, vehicle, Intrinsics.of(vehicle.camera))
     limits = asked.limits
@@ -140,8 +151,14 @@ def prepare(asked: StandAloneCompanion) -> Mission:
 
 def mission_camera(asked: StandAloneCompanion, mission: Mission, clock: Clock) -> OpenCamera:
     """Open the camera that is asked for. Raises FieldError when it cannot be used."""
-    wanted = Intrinsics.of(mission.vehicle.camera)
-    return open_named_camera(asked.camera, clock, wanted, f"vehicle {asked.vehicle}")
+    vehicle = mission.vehicle
+    policy, cameras = mission.policy, vehicle.cameras
+    if isinstance(policy, LearnedPolicy):
+        cameras = {k: v for k, v in cameras.items() if k in policy.card.observation.cameras}
+    further = {name: Intrinsics.of(each) for name, each in cameras.items()}
+    return open_named_camera(
+        *(asked.camera, clock, Intrinsics.of(vehicle.camera), f"vehicle {asked.vehicle}"), further
+    )
 
 
 @contextmanager
@@ -239,6 +256,7 @@ def fly_alone(
                 latency=mission.latency,
                 compensator=mission.compensator,
                 mount_pitch_up_rad=mission.mount_pitch_up_rad,
+                mount_yaw_rad=mission.mount_yaw_rad,
                 start=asked.start,
                 decided=None if box is None else box.decided,
             )

@@ -121,9 +121,10 @@ class Simulation:
         self._camera: OnboardCamera | None = None
         """None on an endless floor."""
         if setup.arena is not None:
-            camera = setup.vehicle.camera
+            vehicle = setup.vehicle
             self._camera = camera_by(
-                camera, setup.arena, start_us, asked.sensors, setup.seed, asked.renderer
+                *(vehicle.camera, setup.arena, start_us, asked.sensors, setup.seed),
+                *(asked.renderer, vehicle.cameras),
             )
             if self.faults is not None:
                 self._camera = FailingCamera(self._camera, self.faults, setup.seed)

@@ -29,7 +29,7 @@ import numpy as np
 import tyro
 import zmq
 
-from airl_mav.camera.frame import Frame
+from airl_mav.camera.frame import Frame, FurtherImage
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.cli.options import read_options, scenario_of
 from airl_mav.cli.sitl import SitlOptions
@@ -232,6 +232,29 @@ def hostile_frame(rng: np.random.Generator, lens: Intrinsics = LENSES[0]) -> byt
     return bytes(frame)
 
 
+def hostile_rig(rng: np.random.Generator, lens: Intrinsics) -> bytes:
+    """Return the bytes of a frame of two cameras: a sound one, or with something wrong in it."""
+    image = np.zeros(lens.shape, lens.dtype)
+    sequence = int(rng.integers(1 << 62))
+    further = {"side": FurtherImage(image, lens)}
+    frame = bytearray(Frame(sequence, 0, image, lens, further=further).to_bytes())
+    kind = int(rng.integers(6))
+    if kind == 1:
+        parts = [(name, hostile_frame(rng, lens)) for name in (b"", b"side")]
+        frame = bytearray(struct.pack("<4sH", b"AMF1", 2))
+        for name, message in parts:
+            frame += struct.pack("<BI", len(name), len(message)) + name + message
+    elif kind == 2:
+        struct.pack_into("<H", frame, 4, SIDES[int(rng.integers(len(SIDES)))])
+    elif kind == 3:
+        struct.pack_into("<I", frame, 7, int(rng.integers(1 << 32)))
+    elif kind == 4:
+        del frame[int(rng.integers(len(frame))) :]
+    elif kind == 5:
+        frame[int(rng.integers(len(frame)))] = int(rng.integers(256))
+    return bytes(frame)
+
+
 def see_hostile_frames(number: int, frames: int = 50) -> str:
     """Publish frames to a companion's camera and decide on each that passes; return the tally.
 
@@ -242,7 +265,7 @@ def see_hostile_frames(number: int, frames: int = 50) -> str:
     lens = LENSES[number % len(LENSES)]
     policy, clock = GreedyPolicy(), SimClock()
     still = Kinematics(np.zeros(3), np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
-    passed = 0
+    passed, hostile = 0, hostile_rig if number % 4 == 3 else hostile_frame
     with zmq.Context() as context, context.socket(zmq.PUB) as publisher:
         publisher.bind("inproc://camera")
         source = ZmqFrameSource("inproc://camera", clock, context)
@@ -250,9 +273,9 @@ def see_hostile_frames(number: int, frames: int = 50) -> str:
             for _ in range(frames):
                 clock.advance(33_333)
                 if rng.random() < 0.1:
-                    publisher.send_multipart([hostile_frame(rng, lens), hostile_frame(rng, lens)])
+                    publisher.send_multipart([hostile(rng, lens), hostile(rng, lens)])
                 else:
-                    publisher.send(hostile_frame(rng, lens))
+                    publisher.send(hostile(rng, lens))
                 seen = source.wait(-1, 0.0)
                 if seen is None:
                     continue

@@ -248,18 +248,17 @@ ENCODINGS: dict[str, tuple[str, int]] = {
 """Of depth, colour and grey: type of the numbers, and channels; 0: no axis of them."""
 
 
-def image_message(image: NDArray[Any], unix_us: int) -> RawImage:
+def image_message(image: NDArray[Any], unix_us: int, camera: str = "camera") -> RawImage:
     """Return the message of a camera's image, taken at a calendar time [µs].
 
-    It is depth (height, width) [mm], or colour (height, width, channels).
+    It is depth (height, width) [mm], or colour (height, width, channels). A further camera has its
+    own name, and its own topic: that of the main one, a slash and the name.
     """
     height, width, *channels = image.shape
     encoding = "mono16" if not channels else "rgb8" if channels == [3] else "mono8"
     rows = np.ascontiguousarray(image, ENCODINGS[encoding][0])
     data = base64.b64encode(rows.tobytes()).decode("ascii")
-    return RawImage(
-        time_of(unix_us), "camera", width, height, encoding, rows.nbytes // height, data
-    )
+    return RawImage(time_of(unix_us), camera, width, height, encoding, rows.nbytes // height, data)
 
 
 def image_of(image: RawImage) -> NDArray[Any]:

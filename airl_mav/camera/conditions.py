@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from importlib.util import find_spec
 
 from airl_mav.core.errors import FieldError
@@ -14,20 +14,26 @@ from airl_mav.profiles.conditions import SensorNoise
 
 
 def check_noise(
-    camera: Camera, asked: SensorNoise, faults: Sequence[Fault], table: str = "sensors"
+    camera: Camera,
+    asked: SensorNoise,
+    faults: Sequence[Fault],
+    table: str = "sensors",
+    further: Iterable[Camera] = (),
 ) -> None:
-    """Raise FieldError for what makes depths worse, where a camera gives none.
+    """Raise FieldError for what makes depths worse, where no camera gives any.
 
     Args:
-        camera: The camera.
+        camera: The main camera, which faults happen to.
         asked: Conditions that its images are taken in.
         faults: What shall fail.
         table: What `asked` is called.
+        further: The vehicle's others.
     """
     if camera.kind == "depth":
         return
+    measured = any(each.kind == "depth" for each in further)
     for name in ("depth_noise", "depth_dropout"):
-        if value := getattr(asked, name):
+        if (value := getattr(asked, name)) and not measured:
             raise FieldError(f"{table}.{name}", value, f"0 with a camera of kind {camera.kind!r}")
     for fault in faults:
         if (fault.part, fault.kind) == ("camera", "noise"):
@@ -35,16 +41,24 @@ def check_noise(
             raise FieldError("faults", str(fault), accepted)
 
 
-def check_renderer(camera: Camera, renderer: Renderer, arena: ArenaSpec) -> None:
+def check_renderer(
+    camera: Camera, renderer: Renderer, arena: ArenaSpec, further: Iterable[Camera] = ()
+) -> None:
     """Raise FieldError for what a renderer does not draw.
 
     Args:
-        camera: The camera.
+        camera: The main camera.
         renderer: What draws.
         arena: Where it looks.
+        further: The vehicle's others.
     """
     if renderer == "raycast":
         return
+    for each in (camera, *further):
+        _check_drawn(each, renderer, arena)
+
+
+def _check_drawn(camera: Camera, renderer: Renderer, arena: ArenaSpec) -> None:
     accepted = None
     if camera.kind == "depth":
         accepted = "raycast with a depth camera; mitsuba draws colour"
@@ -58,12 +72,15 @@ def check_renderer(camera: Camera, renderer: Renderer, arena: ArenaSpec) -> None
         raise FieldError("renderer", renderer, accepted)
 
 
-def check_twin_imaging(camera: Camera) -> None:
-    """Raise FieldError for a gain that takes time, where only decisions take frames."""
+def check_twin_imaging(camera: Camera, name: str = "") -> None:
+    """Raise FieldError for a gain that takes time, where only decisions take frames.
+
+    `name` is that of a further camera.
+    """
     auto = None if camera.imaging is None else camera.imaging.auto_exposure
     if auto is not None and auto.time_constant_s > 0.0:
         raise FieldError(
-            "camera.imaging.auto_exposure.time_constant_s",
+            f"{f'cameras.{name}' if name else 'camera'}.imaging.auto_exposure.time_constant_s",
             auto.time_constant_s,
             "0 in the batch twin, which takes the frames of decisions alone; any in lockstep",
         )

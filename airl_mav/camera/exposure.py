@@ -12,11 +12,15 @@ from airl_mav.camera.frame import depth_to_z16
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.picture import grey, render_picture
 from airl_mav.camera.render import render
+from airl_mav.core.streams import words_of
 from airl_mav.profiles.camera_kind import Renderer
 from airl_mav.vehicle.rotation import Quat, Vec
 
 PATHS = 16
 """Paths that Mitsuba traces through a pixel: their noise is that of a sensor in daylight."""
+
+
+_SEEDS = 1 << 32
 
 
 class Exposure(Protocol):
@@ -35,20 +39,21 @@ class Exposure(Protocol):
         ...
 
 
-def exposure_by(renderer: Renderer) -> Exposure:
-    """Return what takes the images of a camera with this renderer."""
-    return expose if renderer == "raycast" else PathTraced()
+def exposure_by(renderer: Renderer, name: str = "") -> Exposure:
+    """Return what takes the images of a camera with this renderer; "" is the main camera."""
+    return expose if renderer == "raycast" else PathTraced(sum(words_of(name)))
 
 
 class PathTraced:
     """Takes colour images by Mitsuba's path tracer, each with noise of its own."""
 
-    def __init__(self) -> None:
+    def __init__(self, first: int = 0) -> None:
+        """Take the seed of the first image's noise; the next ones follow, modulo 2^32."""
         # Imported here: what it draws with is an extra.
         from airl_mav.camera.mitsuba import PathTracer
 
         self._tracer = PathTracer(PATHS)
-        self._taken = 0
+        self._seed = first
 
     def __call__(
         self,
@@ -61,8 +66,8 @@ class PathTraced:
     ) -> NDArray[Any]:
         """Return the image; see `expose`. Raises as `mitsuba.path_traced`."""
         pose = np.asarray(position), np.asarray(quaternion)
-        rgb = self._tracer(arena, centers, intrinsics, *pose, seed=self._taken)
-        self._taken += 1
+        rgb = self._tracer(arena, centers, intrinsics, *pose, seed=self._seed)
+        self._seed = (self._seed + 1) % _SEEDS
         return rgb if intrinsics.kind == "rgb" else grey(rgb)[..., None]
 
 

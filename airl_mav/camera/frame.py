@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import struct
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -69,8 +70,21 @@ _HEADER = struct.Struct("<4sQqHHddd")
 # k1, k2, k3, k4; little endian
 _COEFFICIENTS = struct.Struct("<4d")
 
+RIG_MAGIC = b"AMF1"
+"""How a frame of several cameras begins: air-learning, many frames; version 1."""
+
+# magic, images; then for each image: bytes of its name, bytes of its message; little endian
+_RIG_HEADER, _PART_HEADER = struct.Struct("<4sH"), struct.Struct("<BI")
+
+MOST_IMAGES = 64
+"""Images of a frame, at most."""
+
+MOST_NAME = 255
+"""Bytes of a camera's name, at most."""
+
 MOST_PIXELS = 4096 * 4096
-MOST_BYTES = _HEADER.size + _COEFFICIENTS.size + 3 * MOST_PIXELS
+_MOST_ADDED = _HEADER.size + _COEFFICIENTS.size + _PART_HEADER.size + MOST_NAME
+MOST_BYTES = _RIG_HEADER.size + MOST_IMAGES * _MOST_ADDED + 3 * MOST_PIXELS
 """Size of the largest frame, 50 MB: whoever receives them need not take in more."""
 
 MM_PER_M = 1000.0
@@ -88,8 +102,17 @@ class FrameError(ValueError):
 
 
 @dataclass(frozen=True)
+class FurtherImage:
+    """What a further camera has taken at the same time; fields as those of `Frame`."""
+
+    image: NDArray[Any]
+    intrinsics: Intrinsics
+    jpeg: bytes | None = None
+
+
+@dataclass(frozen=True)
 class Frame:
-    """One image of a camera."""
+    """One image of a camera, and those that its vehicle's further cameras took with it."""
 
     sequence: int
     """Counts up by one per captured frame."""
@@ -103,6 +126,13 @@ class Frame:
     """Of its camera; its `kind` says what the pixels are."""
     jpeg: bytes | None = None
     """The JPEG file that `image` was decoded from; None: it was never compressed."""
+    further: Mapping[str, FurtherImage] = field(default_factory=dict)
+    """By the name of the camera; empty where there is only the main one."""
+
+    @property
+    def lenses(self) -> dict[str, Intrinsics]:
+        """The further cameras, by name."""
+        return {name: each.intrinsics for name, each in self.further.items()}
 
     @property
     def depth_mm(self) -> NDArray[np.uint16]:
@@ -114,7 +144,23 @@ class Frame:
         return self.depth_mm.astype(np.float32) / np.float32(MM_PER_M)
 
     def to_bytes(self) -> bytes:
-        """Return the wire form."""
+        """Return the wire form: of one image as if there were no further cameras."""
+        if not self.further:
+            return self._message()
+        parts = [("", self._message())]
+        for name, each in self.further.items():
+            alone = Frame(
+                self.sequence, self.capture_time_us, each.image, each.intrinsics, each.jpeg
+            )
+            parts.append((name, alone._message()))
+        wire = [_RIG_HEADER.pack(RIG_MAGIC, len(parts))]
+        for name, message in parts:
+            called = name.encode("ascii")
+            wire += [_PART_HEADER.pack(len(called), len(message)), called, message]
+        return b"".join(wire)
+
+    def _message(self) -> bytes:
+        """Return the wire form of the main image alone."""
         k = self.intrinsics
         magic = (MAGICS if self.jpeg is None else JPEG_MAGICS)[k.kind, k.projection]
         distorts = k.distortion != UNDISTORTED
@@ -135,16 +181,19 @@ class Frame:
 
         Raises FrameError for anything else, also for what no camera takes: an image without pixels
         or with too many, a focal length or a centre out of bounds, or not a number, a cylinder of
-        more than a turn, coefficients out of bounds, a damaged JPEG or one of another size. Raises
-        UsageError for a JPEG where Pillow is not installed.
+        more than a turn, coefficients out of bounds, a damaged JPEG or one of another size; of
+        several cameras also images of different moments, or two of one name. Raises UsageError for
+        a JPEG where Pillow is not installed.
         """
+        if data[: len(RIG_MAGIC)] == RIG_MAGIC:
+            return _of_several(cls, data)
         if len(data) < _HEADER.size:
             raise FrameError(f"{len(data)} bytes are too short for a frame header")
         magic, sequence, time_us, width, height, focal, cx, cy = _HEADER.unpack_from(data)
         plain = _UNDISTORTED_AS.get(magic, magic)
         camera = _CAMERA_OF.get(plain) or _JPEG_CAMERA_OF.get(plain)
         if camera is None:
-            magics = (*_CAMERA_OF, *_JPEG_CAMERA_OF, *_UNDISTORTED_AS)
+            magics = (*_CAMERA_OF, *_JPEG_CAMERA_OF, *_UNDISTORTED_AS, RIG_MAGIC)
             known = " or ".join(repr(each) for each in magics)
             raise FrameError(f"magic {magic!r}, expected {known}")
         kind, projection = camera
@@ -182,6 +231,46 @@ def _coefficients(data: bytes) -> Distortion:
     if not all(abs(each) <= MOST_COEFFICIENT for each in (k1, k2, k3, k4)):
         raise FrameError(f"coefficients {k1}, {k2}, {k3}, {k4}: no fisheye")
     return k1, k2, k3, k4
+
+
+def _of_several(kind: type[Frame], data: bytes) -> Frame:
+    """Return the frame of a message with several images. Raises as `Frame.from_bytes`."""
+    if len(data) < _RIG_HEADER.size:
+        raise FrameError(f"{len(data)} bytes are too short for a frame of several cameras")
+    _, count = _RIG_HEADER.unpack_from(data)
+    if not 1 <= count <= MOST_IMAGES:
+        raise FrameError(f"{count} images: accepted: 1..{MOST_IMAGES}")
+    at, taken, pixels = _RIG_HEADER.size, dict[str, Frame](), 0
+    for _ in range(count):
+        if len(data) < at + _PART_HEADER.size:
+            raise FrameError(f"{len(data)} bytes are too short for {count} images")
+        named, size = _PART_HEADER.unpack_from(data, at)
+        begins = at + _PART_HEADER.size + named
+        at = begins + size
+        if len(data) < at:
+            raise FrameError(f"{len(data)} bytes are too short for {count} images")
+        message = data[begins : begins + size]
+        if message[: len(RIG_MAGIC)] == RIG_MAGIC:
+            raise FrameError("a frame of several cameras within one")
+        name = data[begins - named : begins].decode("latin-1")
+        if name in taken or (not taken) != (name == ""):
+            raise FrameError(f"camera {name!r}: accepted: first one without a name, then others")
+        taken[name] = frame = kind.from_bytes(message)
+        pixels += frame.intrinsics.width * frame.intrinsics.height
+        if pixels > MOST_PIXELS:
+            raise FrameError(f"{pixels} pixels of several cameras: accepted: 1..{MOST_PIXELS}")
+    if at != len(data):
+        raise FrameError(f"{len(data) - at} bytes behind the last of {count} images")
+    main = taken.pop("")
+    for name, each in taken.items():
+        if (each.sequence, each.capture_time_us) != (main.sequence, main.capture_time_us):
+            raise FrameError(f"camera {name!r}: an image of another moment than the main one's")
+    further = {
+        name: FurtherImage(each.image, each.intrinsics, each.jpeg) for name, each in taken.items()
+    }
+    return kind(
+        *(main.sequence, main.capture_time_us, main.image, main.intrinsics, main.jpeg), further
+    )
 
 
 def depth_only(image: NDArray[Any], intrinsics: Intrinsics) -> NDArray[np.uint16]:

@@ -34,7 +34,7 @@ from airl_mav.camera.jpeg import image_of, jpeg_of
 from airl_mav.camera.picture import grey, render_picture
 from airl_mav.camera.render import Motion, Mount, camera_pose, carried_on
 from airl_mav.core.constants import US_PER_MS, US_PER_S
-from airl_mav.core.streams import Stream, stream
+from airl_mav.core.streams import Stream, stream, words_of
 from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.imaging import AutoExposure, Imaging
 
@@ -58,8 +58,12 @@ class Taken(NamedTuple):
 class ImageFormation:
     """Takes the images of one camera with a table `imaging`; its gain may follow the light."""
 
-    def __init__(self, camera: Camera) -> None:
-        """Take a camera of kind rgb or grey; without the table all of it is off."""
+    def __init__(self, camera: Camera, name: str = "") -> None:
+        """Take a camera of kind rgb or grey; without the table all of it is off.
+
+        `name` is that of a further camera, whose noise is drawn apart.
+        """
+        self._own = words_of(name)
         self._imaging = camera.imaging or Imaging()
         self._camera = Intrinsics.of(camera)
         self._mount = Mount.of(camera)
@@ -90,7 +94,7 @@ class ImageFormation:
             UsageError: The file of a mesh cannot be read, or is another one.
         """
         asked = self._imaging
-        off = _off_by(asked, seed)
+        off = _off_by(asked, seed, self._own)
         if asked.auto_exposure is None:
             self.gain = off * asked.gain
         else:
@@ -182,7 +186,7 @@ class ImageFormation:
         if asked.bayer:
             light = mosaic(light)
         if asked.full_well_e is not None:
-            rng = stream(seed, Stream.PHOTONS, frame)
+            rng = stream(seed, Stream.PHOTONS, frame, *self._own)
             light = noisy(light, gain, asked.full_well_e, asked.read_noise_e, rng)
         if asked.bayer:
             light = demosaiced(np.minimum(light, np.float32(1.0)))
@@ -193,11 +197,11 @@ class ImageFormation:
         return Taken(image_of(jpeg, image.shape[0], image.shape[1], channels), jpeg)
 
 
-def _off_by(asked: Imaging, seed: int) -> float:
-    """Return the factor by which the light of an episode is off."""
+def _off_by(asked: Imaging, seed: int, own: tuple[int, ...]) -> float:
+    """Return the factor by which the light of an episode is off; `own` as `streams.words_of`."""
     if not asked.gain_spread_ev:
         return 1.0
-    share = 2.0 * stream(seed, Stream.EXPOSURE).random() - 1.0
+    share = 2.0 * stream(seed, Stream.EXPOSURE, *own).random() - 1.0
     return float(2.0 ** (asked.gain_spread_ev * share))
 
 

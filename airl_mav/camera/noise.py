@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from airl_mav.camera.frame import MAX_MM, MM_PER_M
 from airl_mav.camera.stereo import Matching, matched_depth, matching_of
-from airl_mav.core.streams import Stream, stream
+from airl_mav.core.streams import Stream, stream, words_of
 from airl_mav.profiles.camera import Camera, Ranging
 from airl_mav.profiles.conditions import SensorNoise
 
@@ -27,16 +27,23 @@ class DepthNoise(NamedTuple):
     """That of a lidar; None: none."""
     range_m: float = 0.0
     """Greatest depth of a lidar's return [m]."""
+    own: tuple[int, ...] = ()
+    """`streams.words_of` the camera."""
 
 
-def noise_of(camera: Camera, asked: SensorNoise) -> DepthNoise | None:
-    """Return what happens to the images of a camera; None: nothing."""
+def noise_of(camera: Camera, asked: SensorNoise, name: str = "") -> DepthNoise | None:
+    """Return what happens to the images of a camera; None: nothing, as where it gives no depth.
+
+    `name` is that of a further camera, whose noise is drawn apart.
+    """
+    if camera.kind != "depth":
+        return None
     matching = matching_of(camera, asked.stereo_noise)
     ranging = camera.ranging
     changed = matching is not None or ranging is not None
     if not (changed or asked.depth_noise or asked.depth_dropout):
         return None
-    return DepthNoise(matching, asked, ranging, camera.range_m)
+    return DepthNoise(matching, asked, ranging, camera.range_m, words_of(name))
 
 
 def noisy_frame(
@@ -52,12 +59,14 @@ def noisy_frame(
             that the same moment has the same noise wherever it is flown.
     """
     if noise.matching is not None:
-        depth_mm = matched_depth(depth_mm, noise.matching, stream(seed, Stream.STEREO, frame))
+        rng = stream(seed, Stream.STEREO, frame, *noise.own)
+        depth_mm = matched_depth(depth_mm, noise.matching, rng)
     if noise.ranging is not None:
-        rng = stream(seed, Stream.RANGING, frame)
+        rng = stream(seed, Stream.RANGING, frame, *noise.own)
         depth_mm = ranged_depth(depth_mm, noise.ranging, noise.range_m, rng)
     if noise.asked.depth_noise or noise.asked.depth_dropout:
-        depth_mm = noisy_depth(depth_mm, noise.asked, stream(seed, Stream.DEPTH, frame))
+        rng = stream(seed, Stream.DEPTH, frame, *noise.own)
+        depth_mm = noisy_depth(depth_mm, noise.asked, rng)
     return depth_mm
 
 

@@ -24,13 +24,15 @@ class Mount(NamedTuple):
     offset: Vec
     """Position of the camera in the body frame FRD [m]."""
     pitch_up: float
-    """Angle of the optical axis above the body's forward axis [rad]."""
+    """Angle of the optical axis above the body's level plane [rad]."""
+    yaw: float = 0.0
+    """Heading of the optical axis from the body's forward axis, clockwise seen from above [rad]."""
 
     @classmethod
     def of(cls, camera: Camera) -> Mount:
         """Return how the camera of a vehicle profile is fixed."""
-        offset = (camera.forward_m, 0.0, -camera.up_m)
-        return cls(offset, math.radians(camera.pitch_up_deg))
+        offset = (camera.forward_m, camera.right_m, -camera.up_m)
+        return cls(offset, math.radians(camera.pitch_up_deg), math.radians(camera.yaw_deg))
 
 
 class Motion(NamedTuple):
@@ -79,6 +81,9 @@ def camera_pose(
     # A positive turn about the body's right axis lifts the nose.
     half = 0.5 * mount.pitch_up
     tilt = (math.cos(half), 0.0, math.sin(half), 0.0)
+    if mount.yaw != 0.0:
+        turn = 0.5 * mount.yaw
+        tilt = multiply((math.cos(turn), 0.0, 0.0, math.sin(turn)), tilt)
     return (position[0] + x, position[1] + y, position[2] + z), multiply(q, tilt)
 
 

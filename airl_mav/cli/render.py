@@ -78,7 +78,7 @@ OF_NO_VEHICLE = (
 )
 """Options that the camera of a vehicle profile has no use for: it has its own."""
 
-OF_A_VEHICLE = ("speed_m_s", "yaw_rate_deg_s")
+OF_A_VEHICLE = ("speed_m_s", "yaw_rate_deg_s", "camera_name")
 """Options of what moves with its camera."""
 
 
@@ -94,6 +94,7 @@ class RenderOptions(ProfileModel):
         airl render dense-obstacles --show flow --speed-m-s 5 --out flow.npy
         airl render dense-obstacles --renderer mitsuba --samples 256
         airl render varied-looks --camera my-quad.toml --speed-m-s 5 --yaw-rate-deg-s 60
+        airl render varied-looks --camera quad-rig --camera-name down
         airl render runs/A 7 --out flight.gif
         airl render runs/A 7 --renderer mitsuba --out flight.mp4
     """
@@ -119,6 +120,11 @@ class RenderOptions(ProfileModel):
         description="vehicle profile, a shipped name or a path to a .toml, whose camera takes the"
         " picture: its size, lens and sensor, one ray a pixel; where and how it looks is then where"
         " and how the vehicle does",
+    )
+    camera_name: str | None = Field(
+        default=None,
+        description="with --camera: which of the vehicle's further cameras, by its name in the"
+        " profile ([cameras.NAME]); by default its main one",
     )
     speed_m_s: float = quantity(
         "with --camera or --show flow: how fast it flies ahead", "m/s", ge=-100, le=100, default=0.0
@@ -252,7 +258,22 @@ def _not_asked_for(options: RenderOptions) -> tuple[str, ...]:
     """Return the options that the camera that is asked for has no use for."""
     if options.camera is not None:
         return OF_NO_VEHICLE
-    return () if options.show == "flow" else OF_A_VEHICLE
+    return OF_A_VEHICLE[-1:] if options.show == "flow" else OF_A_VEHICLE
+
+
+def _taking(vehicle: str, name: str | None) -> TakingCamera:
+    """Return a camera of a vehicle profile: a further one by name, or the main one.
+
+    Raises:
+        UsageError: There is no such profile, or it has no such camera.
+    """
+    profile = load_vehicle(vehicle)
+    if name is None:
+        return TakingCamera(profile.camera)
+    if name not in profile.cameras:
+        known = ", ".join(profile.cameras) or f"none: vehicle {vehicle} has its main camera alone"
+        raise FieldError("camera_name", name, known)
+    return TakingCamera(profile.cameras[name], name)
 
 
 def _is_truth(options: RenderOptions, out: Path) -> bool:
@@ -301,7 +322,7 @@ def _picture(options: RenderOptions, out: Path) -> str:
     rates = np.array([0.0, 0.0, math.radians(options.yaw_rate_deg_s)])
     if options.camera is not None:
         motion = Motion(position, attitude, velocity, rates)
-        camera_of = TakingCamera(load_vehicle(options.camera).camera)
+        camera_of = _taking(options.camera, options.camera_name)
         write_png(out, camera_of(arena, elapsed_us, motion, arena.seed))
         return "picture"
     centers = arena.centers_at(elapsed_us)
@@ -330,7 +351,7 @@ def _film(options: RenderOptions, path: Path, out: Path, console: Console) -> st
     camera = _camera(options, FILM_PX)
     flight = run.flight(record)
     times = moments(flight, options.rate_hz)
-    taking = None if options.camera is None else TakingCamera(load_vehicle(options.camera).camera)
+    taking = None if options.camera is None else _taking(options.camera, options.camera_name)
     with RichProgress(console) as progress:
         bar = progress.bar("film", len(times), unit="pictures")
 

@@ -133,9 +133,9 @@ FRD_FROM_OPTICAL = np.array([0.5, 0.5, 0.5, 0.5])
 """The optical frame of a camera that looks along the body's forward axis, as FRD <- optical."""
 
 
-def quat_flu_from_optical(pitch_up: float) -> Vector:
-    """Return FLU <- optical (4,) of a camera that looks so far above the forward axis [rad]."""
-    tilt = quat_from_euler(0.0, pitch_up, 0.0)
+def quat_flu_from_optical(pitch_up: float, yaw: float = 0.0) -> Vector:
+    """Return FLU <- optical (4,) of a camera that looks so far up and right of forward [rad]."""
+    tilt = quat_from_euler(0.0, pitch_up, yaw)
     return quat_normalize(quat_multiply(quat_multiply(_FRD_FROM_FLU, tilt), FRD_FROM_OPTICAL))
 
 

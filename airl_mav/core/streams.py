@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from enum import IntEnum
+from zlib import crc32
 
 import numpy as np
 
@@ -34,6 +35,14 @@ def stream(seed: int, name: Stream, *more: int) -> np.random.Generator:
     from airl_mav.core.seeding import seeded
 
     return seeded(seed, name, *more)
+
+
+def words_of(name: str) -> tuple[int, ...]:
+    """Return what tells the streams of a further camera apart, by its name; "": the main one's.
+
+    By its name, not its place in a list: what one camera draws does not change with the others.
+    """
+    return (crc32(name.encode()),) if name else ()
 
 
 def sensors_and_gusts(

@@ -60,36 +60,23 @@ def lens_of(intrinsics: Intrinsics, range_m: float) -> Lens:
     return Lens(k.focal, k.cx, k.cy, range_m, k.cylindrical, bent_of(k))
 
 
-class Cameras(Stateful):
-    """Frames come at the camera's rate; their phase to the decisions is drawn from the seed."""
+class Eyes:
+    """One camera of each of n vehicles: the images that it takes."""
 
     def __init__(
         self,
         n: int,
         camera: Camera,
-        transport_us: int,
         noise: SensorNoise,
-        faults: Sequence[Fault] = (),
-        looks: Looks | None = None,
-        meshes: MeshesSeen | None = None,
+        looks: Looks | None,
+        meshes: MeshesSeen | None,
+        name: str = "",
     ) -> None:
-        """Make n cameras.
-
-        Args:
-            n: Number of cameras.
-            camera: The camera.
-            transport_us: From capture to decoded [µs].
-            noise: Conditions that their images are taken in.
-            faults: Those of the camera happen to all of them.
-            looks: How their arenas look, which colour cameras need.
-            meshes: Those of their arenas; None: there are none.
-        """
+        """Make n cameras; `name` is that of a further one. The rest as of `Cameras`."""
         self.intrinsics = Intrinsics.of(camera)
         self.image = np.zeros((n, *self.intrinsics.shape), self.intrinsics.dtype)
-        """(n, ...) newest frames, as `camera.frame.Frame.image` of each."""
-        self.period_us = camera.period_us
-        self.transport_us = transport_us
-        self._noise = noise_of(camera, noise)
+        """(n, ...) newest images, as `camera.frame.Frame.image` of each."""
+        self._noise = noise_of(camera, noise, name)
         self._mount = Mount.of(camera)
         self._lens = lens_of(self.intrinsics, camera.range_m)
         self._meshes = MeshesSeen(0) if meshes is None else meshes
@@ -101,7 +88,81 @@ class Cameras(Stateful):
         self._formed: FormedImages | None = None
         """None: the cameras have no table `imaging`."""
         if camera.imaging is not None and looks is not None:
-            self._formed = FormedImages(camera, looks)
+            self._formed = FormedImages(camera, looks, name)
+
+    def take(
+        self,
+        fleet: Fleet,
+        arenas: ArenaBatch,
+        who: NDArray[np.bool_],
+        seeds: NDArray[np.int64],
+        frames: NDArray[np.int64],
+        out: NDArray[Any] | None = None,
+    ) -> None:
+        """Take the images of the vehicles in `who` (n,), from where they are now.
+
+        Args:
+            fleet: Poses, motion and times.
+            arenas: One a vehicle.
+            who: (n,) whose image is taken; the others' stays as it is.
+            seeds: (n,) of the episodes, which noise is drawn from.
+            frames: (n,) numbers of the images in the episodes.
+            out: (n, ...) written; None: `image`.
+        """
+        image: NDArray[Any] = self.image if out is None else out
+        if self._formed is not None:
+            self._formed.render(fleet, who, seeds, frames, image)
+        elif self._colour is None:
+            render_images(fleet, arenas, who, self._mount, self._lens, image, self._meshes.batch)
+        else:
+            self._colour.render(fleet, arenas, who, image)
+        if self._noise is not None:
+            _make_noisy(image, self._noise, who, seeds, frames)
+
+
+class Cameras(Stateful):
+    """Frames come at the main camera's rate; their phase to the decisions is drawn from the seed.
+
+    Further cameras are triggered with it: a frame has the images of all.
+    """
+
+    def __init__(
+        self,
+        n: int,
+        camera: Camera,
+        transport_us: int,
+        noise: SensorNoise,
+        faults: Sequence[Fault] = (),
+        looks: Looks | None = None,
+        meshes: MeshesSeen | None = None,
+        further: Mapping[str, Camera] | None = None,
+    ) -> None:
+        """Make the cameras of n vehicles.
+
+        Args:
+            n: Number of vehicles.
+            camera: The main camera.
+            transport_us: From capture to decoded [µs].
+            noise: Conditions that their images are taken in.
+            faults: Those of the camera happen to all vehicles: `delay` to whole frames, others to
+                the main camera's images.
+            looks: How their arenas look, which colour cameras need.
+            meshes: Those of their arenas; None: there are none.
+            further: Those that are looked at beside the main one, by name; None: none.
+        """
+        self._main = Eyes(n, camera, noise, looks, meshes)
+        self.further = {
+            name: Eyes(n, each, noise, looks, meshes, name)
+            for name, each in (further or {}).items()
+        }
+        """Those that are triggered with the main one, by name."""
+        tables = [each.imaging for each in (camera, *(further or {}).values())]
+        self.exposed_in_motion = any(
+            table is not None and (table.exposure_ms or table.readout_ms) for table in tables
+        )
+        """Whether any image depends on how its vehicle moves when it is taken."""
+        self.period_us = camera.period_us
+        self.transport_us = transport_us
         self._first_us = np.zeros(n, np.int64)
         failing = twin_faults(faults, "camera")
         self._late = [each for each in failing if each.fault.kind == "delay"]
@@ -112,6 +173,16 @@ class Cameras(Stateful):
         """The picture that a camera shows that is stuck, by the fault's number."""
         self._freeze_us = {number: np.zeros(n, np.int64) for number in stuck}
         """When it was taken, or will be [µs]."""
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """Of the main camera."""
+        return self._main.intrinsics
+
+    @property
+    def image(self) -> NDArray[Any]:
+        """(n, ...) newest images of the main cameras, as `camera.frame.Frame.image` of each."""
+        return self._main.image
 
     @property
     def latest_us(self) -> int:
@@ -188,8 +259,8 @@ class Cameras(Stateful):
         for number, at_us in self._freeze_us.items():
             who = np.abs(fleet.time_us - at_us) <= TICK_US // 2
             if who.any():
-                self._render(fleet, arenas, who, seeds, self._frozen[number])
-                self._make_noisy(self._frozen[number], self._noise, who, seeds, fleet.time_us)
+                frames = self._frames(fleet.time_us)
+                self._main.take(fleet, arenas, who, seeds, frames, self._frozen[number])
 
     def next_decoded_us(self, time_us: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return when the next frame is decoded after a time (n,) [µs] of each episode."""
@@ -208,8 +279,9 @@ class Cameras(Stateful):
 
         The noise is drawn from the episodes' `seeds` (n,).
         """
-        self._render(fleet, arenas, who, seeds, self.image)
-        self._make_noisy(self.image, self._noise, who, seeds, fleet.time_us)
+        frames = self._frames(fleet.time_us)
+        for eyes in (self._main, *self.further.values()):
+            eyes.take(fleet, arenas, who, seeds, frames)
         for each in self._changed:
             acts = who & each.at(fleet.time_us)
             if each.number in self._frozen:
@@ -218,38 +290,7 @@ class Cameras(Stateful):
             elif acts.any():
                 noise = DepthNoise(None, SensorNoise(depth_noise=each.fault.amount))
                 own = NOISE_SEED * (each.number + 1) + seeds
-                self._make_noisy(self.image, noise, acts, own, fleet.time_us)
-
-    def _render(
-        self,
-        fleet: Fleet,
-        arenas: ArenaBatch,
-        who: NDArray[np.bool_],
-        seeds: NDArray[np.int64],
-        out: NDArray[Any],
-    ) -> None:
-        """Write the images of the vehicles in `who` (n,), without the noise of conditions."""
-        if self._formed is not None:
-            self._formed.render(fleet, who, seeds, self._frames(fleet.time_us), out)
-        elif self._colour is None:
-            render_images(fleet, arenas, who, self._mount, self._lens, out, self._meshes.batch)
-        else:
-            self._colour.render(fleet, arenas, who, out)
-
-    def _make_noisy(
-        self,
-        image: NDArray[Any],
-        noise: DepthNoise | None,
-        who: NDArray[np.bool_],
-        seeds: NDArray[np.int64],
-        time_us: NDArray[np.int64],
-    ) -> None:
-        """Add noise to the images of `who` (n,), taken at these times (n,) [µs]."""
-        if noise is None:
-            return
-        frame = self._frames(time_us)
-        for i in np.flatnonzero(who).tolist():
-            image[i] = noisy_frame(image[i], noise, int(seeds[i]), int(frame[i]))
+                _make_noisy(self.image, noise, acts, own, frames)
 
     def _frames(self, time_us: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the numbers (n,) of frames that are taken at these times (n,) [µs]."""
@@ -258,7 +299,23 @@ class Cameras(Stateful):
         return frames
 
     def _held(self) -> Mapping[str, Any]:
-        return {"image": self.image, "first_us": self._first_us}
+        held: dict[str, Any] = {"image": self.image, "first_us": self._first_us}
+        # What a checkpoint of an environment of one camera does not have.
+        if self.further:
+            held["further"] = {name: each.image for name, each in self.further.items()}
+        return held
+
+
+def _make_noisy(
+    image: NDArray[Any],
+    noise: DepthNoise,
+    who: NDArray[np.bool_],
+    seeds: NDArray[np.int64],
+    frames: NDArray[np.int64],
+) -> None:
+    """Add noise to the images (n, ...) of `who` (n,), by their numbers (n,) in the episodes."""
+    for i in np.flatnonzero(who).tolist():
+        image[i] = noisy_frame(image[i], noise, int(seeds[i]), int(frames[i]))
 
 
 @kernel

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.policy.observation import Earlier, InFlight, Kinematics, Rows
+from airl_mav.policy.observation import Earlier, InFlight, Kinematics, Rows, View
 from airl_mav.prediction.compensator import Compensator
 from airl_mav.prediction.memory import DecisionMemory
 
@@ -32,6 +32,7 @@ class Companions:
         compensator: Compensator | None,
         told: bool,
         earlier: int = 0,
+        further: Mapping[str, tuple[Intrinsics, int]] | None = None,
     ) -> None:
         """Prepare n companions.
 
@@ -41,6 +42,7 @@ class Companions:
             compensator: Carries forward what is seen; None: nothing does.
             told: Whether the policy is told of its decisions.
             earlier: How many images of the decisions before a policy sees.
+            further: Further cameras by name, and how many of their earlier images it sees.
         """
         self._n = n
         self._compensator = compensator
@@ -55,6 +57,11 @@ class Companions:
         """What the decisions before saw, the newest first; 0 = no return, black, or none yet."""
         self._states = Kinematics(*(np.zeros((earlier, n, size)) for size in (3, 3, 4)))
         """In what states."""
+        self._further = {
+            name: np.zeros((count, n, *lens.shape), lens.dtype)
+            for name, (lens, count) in (further or {}).items()
+        }
+        """What further cameras showed them, by name."""
         self._age_us = np.zeros(n, np.int64)
         """Of the frames, when their decisions begin."""
 
@@ -66,20 +73,32 @@ class Companions:
             self._memory.begin(i)
         self._age_us[i] = 0
         self._earlier[:, i] = 0
+        for kept in self._further.values():
+            kept[:, i] = 0
 
     @property
     def remember(self) -> bool:
         """Whether they keep what they saw: their policies see it again."""
-        return len(self._earlier) > 0
+        return len(self._earlier) > 0 or any(map(len, self._further.values()))
 
-    def deciding(self, image: NDArray[Any], state: Kinematics) -> None:
-        """Keep what all decide on, of those that `remember`: newest images (n, ...), telemetry."""
+    def deciding(
+        self, image: NDArray[Any], state: Kinematics, further: Mapping[str, NDArray[Any]]
+    ) -> None:
+        """Keep what all decide on, of those that `remember`.
+
+        Args:
+            image: (n, ...) newest images of the main cameras.
+            state: Telemetry.
+            further: (n, ...) those of further cameras, by name.
+        """
         if self._compensator is not None:
             image, state = self._image, self._state
         states = zip(vars(self._states).values(), vars(state).values(), strict=True)
-        for kept, new in ((self._earlier, image), *states):
-            kept[1:] = kept[:-1]
-            kept[0] = new
+        others = ((kept, further[name]) for name, kept in self._further.items())
+        for kept, new in ((self._earlier, image), *states, *others):
+            if len(kept):
+                kept[1:] = kept[:-1]
+                kept[0] = new
 
     def aged(self, age_us: Times) -> None:
         """Take how old the frames (n,) are of which the next decisions are made."""
@@ -146,11 +165,23 @@ class Companions:
             (each[0][rows], Kinematics(*each[1:]).rows(rows)) for each in zip(*kept, strict=True)
         ]
 
+    def views(
+        self, images: Mapping[str, NDArray[Any]], lenses: Mapping[str, Intrinsics], rows: Rows
+    ) -> dict[str, View]:
+        """Return what further cameras show, of their newest images (n, ...) by name."""
+        return {
+            name: View(image[rows], lenses[name], tuple(each[rows] for each in self._further[name]))
+            for name, image in images.items()
+        }
+
     def held(self) -> Mapping[str, Any]:
         """Return by name all arrays that change, for checkpoints."""
         held: dict[str, Any] = {}
         if self.remember:
             held["earlier"] = {"depth_mm": self._earlier, **vars(self._states)}
+            kept = {name: each for name, each in self._further.items() if len(each)}
+            if kept:
+                held["earlier_further"] = kept
         if self._compensator is not None:
             foreseen = {"depth_mm": self._image, **vars(self._state)}
             held["compensator"] = {**self._compensator.held(), "foreseen": foreseen}

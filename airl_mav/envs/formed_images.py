@@ -21,9 +21,9 @@ class FormedImages:
     outlasts an image, so that one camera serves all vehicles.
     """
 
-    def __init__(self, camera: Camera, looks: Looks) -> None:
-        """Take the camera, and what holds the vehicles' arenas."""
-        self._formation, self._looks = ImageFormation(camera), looks
+    def __init__(self, camera: Camera, looks: Looks, name: str = "") -> None:
+        """Take the camera, what holds the vehicles' arenas, and the name of a further camera."""
+        self._formation, self._looks = ImageFormation(camera, name), looks
 
     def render(
         self,

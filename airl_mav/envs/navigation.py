@@ -16,10 +16,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.camera.conditions import check_noise, check_twin_imaging
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.constants import TICK_US, US_PER_MS, US_PER_S
-from airl_mav.core.errors import FieldError, UsageError
+from airl_mav.core.errors import FieldError
 from airl_mav.core.streams import Stream, stream
 from airl_mav.envs.arenas import ArenaBatch, move_all_obstacles
 from airl_mav.envs.cameras import Cameras
@@ -44,6 +43,7 @@ from airl_mav.envs.fleet import (
 from airl_mav.envs.flight import advance
 from airl_mav.envs.legs import Legs
 from airl_mav.envs.saved_state import State, Stateful
+from airl_mav.envs.sight import check_conditions, sight_of
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.envs.timing import PipelinedTiming, SequentialTiming, give, ticks_of
 from airl_mav.envs.trace import Trace
@@ -54,7 +54,7 @@ from airl_mav.latency.injection import Injection
 from airl_mav.policy.actions import vertical_speeds
 from airl_mav.policy.layouts import encode_layout
 from airl_mav.policy.observation import Kinematics, Observation, Rows, observe
-from airl_mav.policy.observation_spec import Encoded, ObservationSpec, camera_mismatch
+from airl_mav.policy.observation_spec import Encoded, ObservationSpec
 from airl_mav.prediction.compensator import Compensator
 from airl_mav.profiles.arena import OBSTACLES, ArenaSpec
 from airl_mav.profiles.camera import Camera
@@ -153,20 +153,10 @@ class Navigation(Stateful):
             computer_w = computer.onboard_watts
         self.vehicle: VehicleProfile = vehicle
         self.arena_spec: ArenaSpec = arena or load_profile("arenas", spec.arena, ArenaSpec)
-        self.camera: Camera = spec.camera.of(self.vehicle.camera)
-        self.observation = ObservationSpec(
-            layout=spec.layout,
-            height_px=spec.image_height_px,
-            width_px=spec.image_width_px,
-            projection=self.camera.projection,
-            horizontal_fov_deg=self.camera.horizontal_fov_deg,
-            distortion=self.camera.distortion,
-            range_m=self.camera.range_m,
-            kind=self.camera.kind,
-            frames=spec.frames,
-            in_flight=spec.in_flight,
-            goal_height=spec.goal_height,
-        )
+        sight = sight_of(spec, self.vehicle)
+        self.camera: Camera = sight.camera
+        self.observation: ObservationSpec = sight.observation
+        self.intrinsics: Intrinsics = sight.intrinsics
         known = self.arena_spec.generator == OBSTACLES
         if spec.goal_height and known and self.arena_spec.goal.height_m is None:
             raise FieldError(
@@ -174,9 +164,6 @@ class Navigation(Stateful):
                 True,
                 f"false in arena {spec.arena!r}, whose profile has no goal.height_m",
             )
-        self.intrinsics: Intrinsics = Intrinsics.of(self.camera)
-        if problem := camera_mismatch(self.observation, self.intrinsics):
-            raise UsageError(f"image_width_px, image_height_px: {problem}")
         self.injections = injections_of(spec.delay) if injection is None else (injection,)
         self._trace = trace
         parameters = flown_values(self.vehicle.autopilot_parameters())
@@ -195,7 +182,7 @@ class Navigation(Stateful):
             n,
             self.vehicle.body.width_m,
             arena_seed,
-            looks=self.camera.kind != "depth",
+            looks=sight.coloured,
         )
         self.stages, self.arenas = self._places.stages, self._places.present
         self.seeds, self.zones = self._places.seeds, self._places.zones
@@ -208,8 +195,7 @@ class Navigation(Stateful):
         )
         randomisation = spec.randomisation
         check_spread(self.vehicle, randomisation, "randomisation")
-        check_noise(self.camera, randomisation, faults, "randomisation")
-        check_twin_imaging(self.camera)
+        check_conditions(sight, spec, faults)
         table = self.vehicle.estimation if randomisation.estimation else None
         self._telemetry = Telemetry(n, table, randomisation.navigation_noise)
         check_twin(faults, pipelined=spec.decisions == "pipelined")
@@ -222,6 +208,7 @@ class Navigation(Stateful):
             faults,
             self._places.looks,
             self._places.meshes,
+            sight.further,
         )
         self._uplink = twin_faults(faults, "uplink")
         self._timing: SequentialTiming | PipelinedTiming
@@ -239,6 +226,9 @@ class Navigation(Stateful):
             compensator=compensator,
             told=bool(spec.in_flight),
             earlier=spec.frames - 1,
+            further={
+                name: (lens, spec.cameras[name].frames - 1) for name, lens in sight.lenses.items()
+            },
         )
 
     def begin(self, slots: Sequence[int], seeds: Sequence[int], zone: int | None = None) -> None:
@@ -308,7 +298,15 @@ class Navigation(Stateful):
         goal = self._places.batch.goal[rows]
         if np.isnan(goal[:, 2]).all():
             goal = goal[:, :2]
-        return observe(image, self.intrinsics, state, goal, known.told(rows), known.earlier(rows))
+        eyes = self.cameras.further
+        lenses = {name: each.intrinsics for name, each in eyes.items()}
+        views = known.views(self._further_images(), lenses, rows)
+        return observe(
+            *(image, self.intrinsics, state, goal, known.told(rows), known.earlier(rows)), views
+        )
+
+    def _further_images(self) -> dict[str, NDArray[Any]]:
+        return {name: each.image for name, each in self.cameras.further.items()}
 
     def observe(self, slots: Sequence[int] | None = None) -> Encoded:
         """Return the present observations in the environment's layout.
@@ -368,7 +366,8 @@ class Navigation(Stateful):
         began_us = self.fleet.time_us.copy()
         t2_us = self._delays.take(self._decision) + self._extra_us
         if self._companions.remember:
-            self._companions.deciding(self.cameras.image, self.kinematics())
+            images = self._further_images()
+            self._companions.deciding(self.cameras.image, self.kinematics(), images)
         self._companions.aged(self._timing.fly(self, setpoints, t2_us))
         self._decision += 1
         self._telemetry.step(self._decision, (self.fleet.time_us - began_us) / US_PER_S)
@@ -443,6 +442,8 @@ class Navigation(Stateful):
     def advance_in_legs(self, ticks: NDArray[np.int64], setpoints: NDArray[np.float64]) -> bool:
         """Fly all flights in three legs, if they can be; see `timing.Vehicles`."""
         watched = self._trace is not None or self.cameras.may_freeze
+        # Between legs only places and attitudes are kept, not how the vehicles move.
+        watched |= self.cameras.exposed_in_motion
         if watched or not self._winds.calm or not ticks[:, 0].all():
             return False
         fleet = self.fleet

@@ -5,7 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import (
+    Field,
+    SerializerFunctionWrapHandler,
+    model_serializer,
+    model_validator,
+)
 
 from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import Each, ProfileModel, quantity, validated
@@ -13,7 +18,15 @@ from airl_mav.core.plugins import REWARDS, part_name
 from airl_mav.flight.judge import GOAL_RADIUS_M, TIME_LIMIT_S, GoalRadius, TimeLimit
 from airl_mav.policy.action_sets import PAPER_SPEED_M_S, ActionSetName, ActionSpec
 from airl_mav.policy.actions import DecisionTiming
-from airl_mav.policy.observation_spec import STRIP_ROWS, Frames, GoalHeight, LayoutName, Told
+from airl_mav.policy.observation_spec import (
+    LEAST_ROWS,
+    STRIP_ROWS,
+    CameraName,
+    Frames,
+    GoalHeight,
+    LayoutName,
+    Told,
+)
 from airl_mav.profiles.camera import Camera, check_matched, check_rows
 from airl_mav.profiles.camera_kind import CameraKind
 from airl_mav.profiles.conditions import SensorNoise, Spread, WindSettings
@@ -91,6 +104,26 @@ class CameraChange(ProfileModel):
         check_matched("camera.kind", made)
         check_rows("camera.height_px", made)
         return made
+
+
+class FurtherImage(ProfileModel):
+    """The image of a further camera, as the network sees it."""
+
+    image_width_px: int | None = quantity(
+        "image that the network sees; left out: as wide as the camera's",
+        "px",
+        ge=4,
+        le=640,
+        default=None,
+    )
+    image_height_px: int | None = quantity(
+        "image that the network sees; left out: as high as the camera's",
+        "px",
+        ge=LEAST_ROWS,
+        le=480,
+        default=None,
+    )
+    frames: Frames = 1
 
 
 class Delay(ProfileModel):
@@ -268,6 +301,10 @@ class EnvironmentSpec(ProfileModel):
         description="of unsteady commands, energy and failures, beside the reward",
     )
     camera: CameraChange = Field(default_factory=CameraChange, description="camera, if another")
+    cameras: dict[CameraName, FurtherImage] = Field(
+        default_factory=dict,
+        description="further cameras of the vehicle that the network sees by, by their names",
+    )
     episode: EpisodeRules = Field(default_factory=EpisodeRules, description="rules")
     delay: Delay = Field(default_factory=Delay, description="how late decisions are")
     decisions: DecisionTiming = Field(
@@ -291,6 +328,14 @@ class EnvironmentSpec(ProfileModel):
         default=None, description="zones by success; left out: the whole arena from the start"
     )
 
+    @model_serializer(mode="wrap")
+    def _without_unused(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        # What is noted of an environment of one camera is what it was before there were more.
+        data: dict[str, Any] = dump(self)
+        if not self.cameras:
+            data.pop("cameras", None)
+        return data
+
     @model_validator(mode="after")
     def _decides_in_time(self) -> EnvironmentSpec:
         if self.episode.hold_s >= self.episode.time_limit_s:
@@ -306,6 +351,19 @@ class EnvironmentSpec(ProfileModel):
             raise ValueError(
                 "decisions = 'pipelined': with episode.hover_after_s: accepted: one of them, as no"
                 " hold ends"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _sees_by_further_cameras(self) -> EnvironmentSpec:
+        if self.cameras and self.layout == "paper":
+            raise ValueError(
+                f"cameras = {', '.join(self.cameras)}: accepted: none with layout 'paper'"
+            )
+        if self.cameras and self.compensate:
+            raise ValueError(
+                "compensate = true: accepted: false with further cameras, whose images are not"
+                " carried forward"
             )
         return self
 

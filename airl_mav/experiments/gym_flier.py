@@ -46,6 +46,8 @@ def environment_of(scenario: ResolvedScenario) -> EnvironmentSpec:
         # It looks at the camera's own image.
         camera = scenario.vehicle.camera
         shape = {"image_width_px": camera.width_px, "image_height_px": camera.height_px}
+        if scenario.policy.program is not None:
+            shape["cameras"] = {name: {} for name in scenario.vehicle.cameras}
     else:
         shape = {
             "layout": card.observation.layout,
@@ -55,6 +57,14 @@ def environment_of(scenario: ResolvedScenario) -> EnvironmentSpec:
             "in_flight": card.observation.in_flight,
             "actions": card.actions.set,
             "max_speed_m_s": card.actions.max_speed_m_s,
+            "cameras": {
+                name: {
+                    "image_width_px": seen.width_px,
+                    "image_height_px": seen.height_px,
+                    "frames": seen.frames,
+                }
+                for name, seen in card.observation.cameras.items()
+            },
         }
     pilot = scenario.pilot
     return spec_of(

@@ -200,7 +200,10 @@ def _noticed(
     if policy.card.observation.kind != "depth":
         kind = policy.card.observation.kind
         raise FieldError("sensing_distance_m", problem=f"needed: policy {policy.name} sees {kind}")
-    if (reason := vehicle_mismatch(policy.card, vehicle.camera)) is not None:
+    if policy.card.observation.cameras:
+        problem = f"needed: policy {policy.name} sees by further cameras"
+        raise FieldError("sensing_distance_m", problem=problem)
+    if (reason := vehicle_mismatch(policy.card, vehicle.camera, vehicle.cameras)) is not None:
         raise FieldError("policy", request.policy, problem=f"does not fit the vehicle: {reason}")
     depths = noticed_m(load_learned(policy.folder, policy.card), vehicle)
     if not depths.min() > 0.0:

@@ -69,5 +69,8 @@ class WitnessedPolicy:
         """Return the policy's action."""
         seen = observation
         numbers = np.array([*seen.goal, *seen.velocity, seen.roll, seen.pitch, seen.yaw])
-        self._digest.add("observations", 0, seen.image.tobytes() + numbers.tobytes())
+        data = seen.image.tobytes() + numbers.tobytes()
+        for name, view in seen.further.items():
+            data += name.encode() + view.image.tobytes()
+        self._digest.add("observations", 0, data)
         return self._policy.act(observation)

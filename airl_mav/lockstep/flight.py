@@ -232,6 +232,7 @@ class _Flight:
             latency=latency,
             compensator=compensator,
             mount_pitch_up_rad=math.radians(resolved.vehicle.camera.pitch_up_deg),
+            mount_yaw_rad=math.radians(resolved.vehicle.camera.yaw_deg),
             decided=decided,
         )
 

@@ -91,5 +91,6 @@ def fly_in_lockstep(
                 latency=mission.latency or FixedSampler(NATIVE_T2_US),
                 compensator=mission.compensator,
                 mount_pitch_up_rad=mission.mount_pitch_up_rad,
+                mount_yaw_rad=mission.mount_yaw_rad,
             )
     return result, {SEEN: digest.lanes()[SEEN]}

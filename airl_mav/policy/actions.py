@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal, Protocol, runtime_checkable
 
@@ -80,6 +81,15 @@ class CameraBound(Protocol):
 
     def refuses(self, camera: Intrinsics) -> str | None:
         """Return why a camera cannot serve the policy, or None when it can."""
+        ...
+
+
+@runtime_checkable
+class RigBound(CameraBound, Protocol):
+    """One that asks for further cameras, or may."""
+
+    def refuses_further(self, cameras: Mapping[str, Intrinsics]) -> str | None:
+        """Return why further cameras, by name, cannot serve the policy, or None when they can."""
         ...
 
 

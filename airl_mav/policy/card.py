@@ -7,6 +7,7 @@ that no card ever speaks for another file.
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Protocol
 
@@ -21,7 +22,11 @@ from airl_mav.policy.action_sets import CONTINUOUS, ActionSpec
 from airl_mav.policy.action_sets import SHIPPED as SHIPPED_ACTION_SETS
 from airl_mav.policy.actions import DecisionTiming
 from airl_mav.policy.observation_spec import SHIPPED as SHIPPED_LAYOUTS
-from airl_mav.policy.observation_spec import ObservationSpec, camera_mismatch
+from airl_mav.policy.observation_spec import (
+    ObservationSpec,
+    camera_mismatch,
+    further_mismatch,
+)
 from airl_mav.policy.runtime import OnnxRuntime
 from airl_mav.profiles.camera import Camera
 
@@ -296,8 +301,22 @@ def open_model(
         raise UsageError(f"{folder / ONNX_FILE}: {error}") from None
 
 
-def vehicle_mismatch(card: PolicyCard, camera: Camera) -> str | None:
-    """Return why a vehicle's camera cannot serve a policy, or None when it can."""
+def vehicle_mismatch(
+    card: PolicyCard, camera: Camera, further: Mapping[str, Camera] | None = None
+) -> str | None:
+    """Return why a vehicle's camera, and further ones by name, cannot serve a policy; None: can."""
+    seen, others = card.observation, further or {}
+    lenses = {name: Intrinsics.of(each) for name, each in others.items()}
+    if (reason := further_mismatch(seen, lenses)) is not None:
+        return reason
+    if seen.layout == "scan" and camera.yaw_deg != 0.0:
+        return f"camera with yaw_deg = {camera.yaw_deg:g}; accepted: 0 with layout 'scan'"
+    for name, each in seen.cameras.items():
+        if each.kind == "depth" and others[name].range_m < each.range_m:
+            return (
+                f"camera {name!r} with a range of {others[name].range_m:g} m;"
+                f" accepted: {each.range_m:g} m or more"
+            )
     if (reason := camera_mismatch(card.observation, Intrinsics.of(camera))) is not None:
         return reason
     # What lies between the two would look free, and was not so in training. Colour has no range.

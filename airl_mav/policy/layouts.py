@@ -5,7 +5,8 @@ Air Learning's own input as its code has it: a 154 x 256 image whose top rows dr
 the goal, and vectors in the world frame. `scan` is `body` with a level scan, as a planar lidar's,
 in place of the depth image; earlier frames are carried to where the vehicle is now. All are Dicts
 of the image, `velocity` and `goal`; the image's key is what the camera gives: `depth`, `rgb` or
-`grey`. Any other is the user's own (`own_layouts`).
+`grey`. Images of further cameras follow, under KIND_NAME. Any other layout is the user's own
+(`own_layouts`).
 
 The function that trains is the function that flies: `encode_layout` takes n vehicles at a time,
 and the companion is n = 1.
@@ -14,7 +15,7 @@ and the companion is n = 1.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ from numpy.typing import NDArray
 
 from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import heading_to_ned
-from airl_mav.policy.images import NUMPY, Shrink, body_bytes, paper_bytes
+from airl_mav.policy.images import NUMPY, Bytes, Shrink, body_bytes, paper_bytes
 from airl_mav.policy.observation import InFlight, Observation
 from airl_mav.policy.observation_spec import (
     SHIPPED,
@@ -31,6 +32,7 @@ from airl_mav.policy.observation_spec import (
     Box,
     Encoded,
     ObservationSpec,
+    SeenCamera,
     Told,
 )
 from airl_mav.policy.own_layouts import own_arrays, own_boxes
@@ -78,7 +80,16 @@ def boxes(spec: ObservationSpec) -> dict[str, Box]:
     if spec.in_flight:
         numbers = sum(TOLD[name] for name in spec.in_flight)
         found[IN_FLIGHT] = Box((numbers,), np.float32, -math.inf, math.inf)
-    return found
+    return found | further_boxes(spec)
+
+
+def further_boxes(spec: ObservationSpec) -> dict[str, Box]:
+    """Return the images of further cameras, by key, sorted."""
+    found = {
+        key: Box((seen.channels, seen.height_px, seen.width_px), np.uint8, 0, 255)
+        for key, seen in zip(spec.further_keys.values(), spec.cameras.values(), strict=True)
+    }
+    return dict(sorted(found.items()))
 
 
 def encode_layout(spec: ObservationSpec, seen: Observation, shrink: Shrink = NUMPY) -> Encoded:
@@ -103,11 +114,13 @@ def encode_layout(spec: ObservationSpec, seen: Observation, shrink: Shrink = NUM
         north, east [m] and distance [m].
         Where the network is told more, `in_flight` (n, k) float32: forward, right / 5 m/s and yaw
         rate [rad/s]; latency [s]; age [s].
+        Of each further camera its image as in `body`, whichever layout it is: `grey_down`
+        (n, frames, height, width) of a grey camera called down.
 
     Raises:
         ValueError: The network is told of decisions of which nobody keeps account.
         UsageError: A layout of the user's gives anything else than it says; or the network is told
-            how high the goal is, and it has no height.
+            how high the goal is, and it has no height; or a further camera shows nothing.
     """
     if spec.layout not in SHIPPED:
         return own_arrays(spec, seen)
@@ -134,7 +147,7 @@ def encode_layout(spec: ObservationSpec, seen: Observation, shrink: Shrink = NUM
     }
     if spec.in_flight:
         encoded[IN_FLIGHT] = _told(spec.in_flight, seen.in_flight)
-    return encoded
+    return encoded | _further(spec, seen, shrink)
 
 
 def _below(seen: Observation) -> NDArray[np.float64]:
@@ -147,9 +160,31 @@ def _below(seen: Observation) -> NDArray[np.float64]:
 
 def _images(spec: ObservationSpec, seen: Observation, shrink: Shrink) -> NDArray[np.uint8]:
     """Return the network's images (n, channels, rows of the camera, width), the newest first."""
+    bytes_of = (body_bytes if spec.layout == "body" else paper_bytes)(spec.range_m)
+    return _stack(spec, (seen.image, *seen.earlier), bytes_of, shrink)
+
+
+def _further(spec: ObservationSpec, seen: Observation, shrink: Shrink) -> Encoded:
+    """Return the network's images of further cameras, by key. Raises UsageError without one."""
+    encoded: Encoded = {}
+    for name, key in sorted(spec.further_keys.items(), key=lambda each: each[1]):
+        if name not in seen.further:
+            raise UsageError(f"the network sees by a camera {name!r}, and there is no image of it")
+        view, camera = seen.further[name], spec.cameras[name]
+        images = (view.image, *view.earlier)
+        encoded[key] = _stack(camera, images, body_bytes(camera.range_m), shrink)
+    return encoded
+
+
+def _stack(
+    spec: ObservationSpec | SeenCamera,
+    images: Sequence[NDArray[Any]],
+    bytes_of: Bytes,
+    shrink: Shrink,
+) -> NDArray[np.uint8]:
+    """Return what a network sees of a camera's images, the newest first, blank where none are."""
     rows, columns = spec.camera_rows, spec.width_px
     if spec.kind == "depth":
-        bytes_of = (body_bytes if spec.layout == "body" else paper_bytes)(spec.range_m)
 
         def network(image: NDArray[Any]) -> NDArray[np.uint8]:
             return shrink.depth(image, rows, columns, bytes_of)[:, None]
@@ -158,12 +193,12 @@ def _images(spec: ObservationSpec, seen: Observation, shrink: Shrink) -> NDArray
         def network(image: NDArray[Any]) -> NDArray[np.uint8]:
             return shrink.colour(image, rows, columns)
 
-    newest = network(seen.image)
+    newest = network(images[0])
     if spec.frames == 1:
         return newest
     blank, channels = (255 if spec.kind == "depth" else 0), CHANNELS[spec.kind]
     stack = np.full((len(newest), spec.channels, rows, columns), blank, np.uint8)
-    for k, image in enumerate((seen.image, *seen.earlier[: spec.frames - 1])):
+    for k, image in enumerate(images[: spec.frames]):
         stack[:, k * channels : (k + 1) * channels] = newest if k == 0 else network(image)
     return stack
 

@@ -23,7 +23,7 @@ from airl_mav.policy.card import (
 )
 from airl_mav.policy.layouts import ablated, boxes, encode_layout
 from airl_mav.policy.observation import Observation
-from airl_mav.policy.observation_spec import camera_mismatch
+from airl_mav.policy.observation_spec import camera_mismatch, further_mismatch
 from airl_mav.policy.runtime import (
     Memory,
     RecurrentRuntime,
@@ -69,8 +69,8 @@ class LearnedPolicy:
         self._runtime = runtime
         self._rng = rng
         self._ablate = ablate
-        self._fitting: Intrinsics | None = None
-        """The camera that was found to fit."""
+        self._fitting: tuple[Intrinsics, ...] = ()
+        """The cameras that were found to fit."""
         self._memory: Memory | None = None
         """What the network remembers of its flights; None before their first decision."""
 
@@ -87,6 +87,10 @@ class LearnedPolicy:
         """Return why a camera cannot serve the policy, or None when it can."""
         return camera_mismatch(self.card.observation, camera)
 
+    def refuses_further(self, cameras: Mapping[str, Intrinsics]) -> str | None:
+        """Return why further cameras, by name, cannot serve the policy, or None when they can."""
+        return further_mismatch(self.card.observation, cameras)
+
     def act(self, observation: Observation) -> Action:
         """Return the action for an observation of one vehicle.
 
@@ -94,10 +98,14 @@ class LearnedPolicy:
             UsageError: The camera is not one that the policy was trained with.
             ValueError: The network gives no number.
         """
-        if observation.intrinsics != self._fitting:
-            if (reason := self.refuses(observation.intrinsics)) is not None:
+        further = observation.further
+        looks = (observation.intrinsics, *(each.intrinsics for each in further.values()))
+        if looks != self._fitting:
+            lenses = {name: each.intrinsics for name, each in further.items()}
+            reason = self.refuses(observation.intrinsics) or self.refuses_further(lenses)
+            if reason is not None:
                 raise UsageError(f"policy {self.card.name}: {reason}")
-            self._fitting = observation.intrinsics
+            self._fitting = looks
         encoded = encode_layout(self.card.observation, observation.rows(None))
         return command(self.card.actions, self.act_batch(encoded)[0])
 

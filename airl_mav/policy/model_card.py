@@ -70,9 +70,13 @@ def _page(card: PolicyCard) -> Iterator[str]:
     image = image if seen.projection == "pinhole" else f"{seen.projection} {image}"
     far = f", up to {seen.range_m:g} m" if seen.kind == "depth" else ""
     high = " with its height" if seen.goal_height else ""
+    others = "".join(
+        f"; camera `{name}`: {each.kind} image of {each.width_px}x{each.height_px} px"
+        for name, each in seen.cameras.items()
+    )
     yield (
         f"| sees | {image} of {seen.width_px}x{seen.height_px} px, {seen.horizontal_fov_deg:g} "
-        f"deg wide{far}; own velocity; goal{high} (layout `{seen.layout}`) |"
+        f"deg wide{far}{others}; own velocity; goal{high} (layout `{seen.layout}`) |"
     )
     yield f"| decides | `{actions.set}`, up to {actions.max_speed_m_s:.3g} m/s |"
     yield f"| holds each action | {card.hold_s:g} s |"

@@ -7,8 +7,8 @@ one vehicle in the companion and of n at a time in training.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -58,6 +58,22 @@ class InFlight:
 
 
 @dataclass(frozen=True)
+class View:
+    """What a further camera shows, of one vehicle or with a leading axis of n."""
+
+    image: NDArray[Any]
+    """As `Observation.image`."""
+    intrinsics: Intrinsics
+    earlier: tuple[NDArray[Any], ...] = ()
+    """Its images of the decisions before, as far as they are kept, the newest first."""
+
+    def rows(self, index: Rows) -> View:
+        """Return that of vehicle `index` of n, or of several of them."""
+        earlier = tuple(image[index] for image in self.earlier)
+        return View(self.image[index], self.intrinsics, earlier)
+
+
+@dataclass(frozen=True)
 class Observation:
     """Input of a policy, of one vehicle or with a leading axis of n.
 
@@ -85,6 +101,8 @@ class Observation:
     """Own states: the present one, and behind it those of `earlier`."""
     goal_down: Vector | None = None
     """(...) how far the goal lies below the vehicle [m]; None: it has no height."""
+    further: Mapping[str, View] = field(default_factory=dict)
+    """What the vehicle's further cameras show, by name; they look at the same moment."""
 
     def rows(self, index: Rows) -> Observation:
         """Return what vehicle `index` of n sees, or several of them."""
@@ -96,6 +114,7 @@ class Observation:
             found["goal_down"] = np.asarray(self.goal_down)[index]
         found["earlier"] = tuple(image[index] for image in self.earlier)
         found["states"] = tuple(state.rows(index) for state in self.states)
+        found["further"] = {name: each.rows(index) for name, each in self.further.items()}
         return replace(self, **found)
 
     @property
@@ -133,7 +152,21 @@ Earlier = Sequence[tuple[NDArray[Any], Kinematics]]
 
 def encode(frame: Frame, state: Kinematics, goal: Goal) -> Observation:
     """Return the observation of a frame, telemetry and a goal."""
-    return observe(frame.image, frame.intrinsics, state, np.asarray(goal, np.float64))
+    where = np.asarray(goal, np.float64)
+    return observe(frame.image, frame.intrinsics, state, where, further=views_of(frame))
+
+
+def views_of(frame: Frame, earlier: Sequence[Mapping[str, NDArray[Any]]] = ()) -> dict[str, View]:
+    """Return what the further cameras of a frame show.
+
+    Args:
+        frame: The frame.
+        earlier: The images of the decisions before by camera, the newest first.
+    """
+    return {
+        name: View(each.image, each.intrinsics, tuple(then[name] for then in earlier))
+        for name, each in frame.further.items()
+    }
 
 
 def observe(
@@ -143,6 +176,7 @@ def observe(
     goal: Vector,
     in_flight: InFlight | None = None,
     earlier: Earlier = (),
+    further: Mapping[str, View] | None = None,
 ) -> Observation:
     """Return the observation of one vehicle, or of n.
 
@@ -153,6 +187,7 @@ def observe(
         goal: (..., 2) north, east [m], or (..., 3): down as well, where it has a height.
         in_flight: What is known of the decisions; None: nothing is.
         earlier: What the decisions before saw, and the states they saw it in, the newest first.
+        further: What further cameras show, by name; None: there are none.
     """
     roll, pitch, yaw = quats_to_euler(state.quaternion)
     to_goal = np.zeros_like(state.position)
@@ -169,4 +204,5 @@ def observe(
         earlier=tuple(image for image, _ in earlier),
         states=(state, *(then for _, then in earlier)),
         goal_down=goal[..., 2] - state.position[..., 2] if goal.shape[-1] == 3 else None,
+        further=further or {},
     )

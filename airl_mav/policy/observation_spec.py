@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import (
+    AfterValidator,
+    Field,
+    SerializerFunctionWrapHandler,
+    model_serializer,
+    model_validator,
+)
 
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core import plugins
@@ -16,6 +23,7 @@ from airl_mav.policy.scans import goes_round
 from airl_mav.profiles.camera import Coefficients
 from airl_mav.profiles.camera_kind import CHANNELS, CameraKind
 from airl_mav.profiles.distortion import UNDISTORTED, check_distortion, distorted, undistorted
+from airl_mav.profiles.further_cameras import camera_named
 from airl_mav.profiles.projection import CYLINDER_MOST_DEG, Projection, check_fov
 
 SHIPPED = ("body", "paper", "scan")
@@ -63,8 +71,84 @@ GoalHeight = Annotated[
 ]
 
 
+Width = Annotated[int, quantity("width of the image that the network sees", "px", ge=4, le=640)]
+
+SeenProjection = Annotated[
+    Projection,
+    Field(
+        description="how directions fall on the image: pinhole, cylindrical for a field of view of"
+        " up to 360 deg, or fisheye (equidistant but for its distortion) of up to 190 deg"
+    ),
+]
+
+FieldOfView = Annotated[
+    float,
+    quantity(
+        "horizontal field of view, less than 170 with a pinhole",
+        "deg",
+        gt=10,
+        le=CYLINDER_MOST_DEG,
+    ),
+]
+
+SeenDistortion = Annotated[Coefficients, quantity("coefficients k1, k2, k3, k4 of a fisheye", "1")]
+
+Range = Annotated[
+    float,
+    quantity(
+        "depth from which on everything looks far; rgb and grey images have no such depth",
+        "m",
+        gt=0.5,
+        le=65,
+    ),
+]
+
+CameraName = Annotated[str, AfterValidator(camera_named)]
+"""Of a further camera."""
+
+
+class SeenCamera(ProfileModel):
+    """A further camera, whose image a network takes beside the main one's."""
+
+    height_px: int = quantity(
+        "height of the image that the network sees", "px", ge=LEAST_ROWS, le=480
+    )
+    width_px: Width
+    projection: SeenProjection = "pinhole"
+    horizontal_fov_deg: FieldOfView
+    distortion: SeenDistortion = UNDISTORTED
+    range_m: Range
+    kind: CameraKind = Field(
+        default="depth", description="what the camera gives, which begins the image's key"
+    )
+    frames: Frames = 1
+
+    @model_serializer(mode="wrap")
+    def _without_unused(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        data: dict[str, Any] = dump(self)
+        if self.distortion == UNDISTORTED:
+            data.pop("distortion", None)
+        return data
+
+    @model_validator(mode="after")
+    def _sees(self) -> SeenCamera:
+        check_fov("horizontal_fov_deg", self.projection, self.horizontal_fov_deg)
+        check_distortion("distortion", self.projection, self.horizontal_fov_deg, self.distortion)
+        return self
+
+    @property
+    def camera_rows(self) -> int:
+        """Rows of the image that come from the camera: all."""
+        return self.height_px
+
+    @property
+    def channels(self) -> int:
+        """Channels of the image that the network sees: those of a frame, for each frame."""
+        return CHANNELS[self.kind] * self.frames
+
+
 class ObservationSpec(ProfileModel):
-    """What a network takes, and the camera that can provide it."""
+    """What a network takes, and the cameras that can provide it."""
 
     layout: LayoutName = Field(default="body", description="which arrays it takes")
     height_px: int = quantity(
@@ -73,27 +157,11 @@ class ObservationSpec(ProfileModel):
         ge=1,
         le=480,
     )
-    width_px: int = quantity("width of the image that the network sees", "px", ge=4, le=640)
-    projection: Projection = Field(
-        default="pinhole",
-        description="how directions fall on the image: pinhole, cylindrical for a field of view of"
-        " up to 360 deg, or fisheye (equidistant but for its distortion) of up to 190 deg",
-    )
-    horizontal_fov_deg: float = quantity(
-        "horizontal field of view, less than 170 with a pinhole",
-        "deg",
-        gt=10,
-        le=CYLINDER_MOST_DEG,
-    )
-    distortion: Coefficients = quantity(
-        "coefficients k1, k2, k3, k4 of a fisheye", "1", default=UNDISTORTED
-    )
-    range_m: float = quantity(
-        "depth from which on everything looks far; rgb and grey images have no such depth",
-        "m",
-        gt=0.5,
-        le=65,
-    )
+    width_px: Width
+    projection: SeenProjection = "pinhole"
+    horizontal_fov_deg: FieldOfView
+    distortion: SeenDistortion = UNDISTORTED
+    range_m: Range
     kind: CameraKind = Field(
         default="depth",
         description="what the camera gives, and the key of the image: depth, rgb or grey",
@@ -105,6 +173,11 @@ class ObservationSpec(ProfileModel):
         " that is expected; age, of the image",
     )
     goal_height: GoalHeight = False
+    cameras: dict[CameraName, SeenCamera] = Field(
+        default_factory=dict,
+        description="further cameras that the network sees by, by name; the image of camera NAME"
+        " has the key KIND_NAME",
+    )
 
     @model_serializer(mode="wrap")
     def _without_unused(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -114,6 +187,8 @@ class ObservationSpec(ProfileModel):
             data.pop("goal_height", None)
         if self.distortion == UNDISTORTED:
             data.pop("distortion", None)
+        if not self.cameras:
+            data.pop("cameras", None)
         return data
 
     @model_validator(mode="after")
@@ -138,6 +213,10 @@ class ObservationSpec(ProfileModel):
             )
         if self.goal_height and self.layout == "paper":
             raise ValueError("goal_height = true: accepted: false with layout 'paper'")
+        if self.cameras and self.layout == "paper":
+            raise ValueError(
+                f"cameras = {', '.join(self.cameras)}: accepted: none with layout 'paper'"
+            )
         check_fov("horizontal_fov_deg", self.projection, self.horizontal_fov_deg)
         check_distortion("distortion", self.projection, self.horizontal_fov_deg, self.distortion)
         return self
@@ -170,6 +249,11 @@ class ObservationSpec(ProfileModel):
         """Channels of the image that the network sees: those of a frame, for each frame."""
         return 1 if self.layout == "scan" else CHANNELS[self.kind] * self.frames
 
+    @property
+    def further_keys(self) -> dict[str, str]:
+        """Keys of the further cameras' images, by their names."""
+        return {name: f"{seen.kind}_{name}" for name, seen in self.cameras.items()}
+
 
 class Box(NamedTuple):
     """Shape, type and bounds of one array of a layout, without the leading axis."""
@@ -180,7 +264,21 @@ class Box(NamedTuple):
     high: float
 
 
-def camera_mismatch(spec: ObservationSpec, camera: Intrinsics) -> str | None:
+def further_mismatch(spec: ObservationSpec, cameras: Mapping[str, Intrinsics]) -> str | None:
+    """Return why further cameras, by name, cannot serve a layout, or None when they can.
+
+    Those that it does not name may be anything.
+    """
+    for name, seen in spec.cameras.items():
+        if name not in cameras:
+            others = "".join(f", {each!r}" for each in cameras)
+            return f"no camera {name!r}; there is the main one{others or ' alone'}"
+        if (reason := camera_mismatch(seen, cameras[name])) is not None:
+            return f"camera {name!r}: {reason}"
+    return None
+
+
+def camera_mismatch(spec: ObservationSpec | SeenCamera, camera: Intrinsics) -> str | None:
     """Return why a camera cannot serve a layout, or None when it can.
 
     It gives what the network takes, its image is a whole multiple of the network's, projection,
@@ -214,7 +312,7 @@ def camera_mismatch(spec: ObservationSpec, camera: Intrinsics) -> str | None:
     return None
 
 
-def _apart_deg(spec: ObservationSpec, camera: Intrinsics) -> float:
+def _apart_deg(spec: ObservationSpec | SeenCamera, camera: Intrinsics) -> float:
     """Return how far apart two lenses see, at most, what they have in one place of the image.
 
     Their fields of view are the same; this is between the middle of the image and its edge [deg].

@@ -19,7 +19,10 @@ class Layout(Protocol):
     """A layout of the user's."""
 
     def boxes(self, spec: ObservationSpec) -> Mapping[str, Box]:
-        """Return its arrays by key: `spec.kind` uint8 (channels, height, width), others float32."""
+        """Return its arrays by key: `spec.kind` uint8 (channels, height, width), others float32.
+
+        The same of the keys of further cameras (`spec.further_keys`).
+        """
         ...
 
     def encode(self, spec: ObservationSpec, seen: Observation) -> Mapping[str, NDArray[Any]]:
@@ -30,15 +33,17 @@ class Layout(Protocol):
 def own_boxes(spec: ObservationSpec) -> dict[str, Box]:
     """Return the arrays of a layout of the user's by key, sorted, if a network can take them."""
     found = {key: Box(*box) for key, box in sorted(_own(spec.layout).boxes(spec).items())}
+    images = {spec.kind, *spec.further_keys.values()}
     wrong = [
         f"{key} {np.dtype(box.dtype)} {box.shape}"
         for key, box in found.items()
-        if len(box.shape) != (3 if key == spec.kind else 1)
-        or np.dtype(box.dtype) != np.dtype(np.uint8 if key == spec.kind else np.float32)
+        if len(box.shape) != (3 if key in images else 1)
+        or np.dtype(box.dtype) != np.dtype(np.uint8 if key in images else np.float32)
     ]
-    if wrong or spec.kind not in found:
+    if wrong or not images <= found.keys():
         problem = f"its arrays are {', '.join(wrong) or ', '.join(found)}"
-        wanted = f"{spec.kind} uint8 (channels, height, width), all others float32 (k,)"
+        named = ", ".join((spec.kind, *sorted(spec.further_keys.values())))
+        wanted = f"{named} uint8 (channels, height, width), all others float32 (k,)"
         raise FieldError(
             plugins.LAYOUTS.field, spec.layout, problem=f"{problem}; accepted: {wanted}"
         )

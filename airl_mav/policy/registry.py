@@ -17,8 +17,8 @@ from airl_mav.policy.card import CARD_FILE, ONNX_FILE, PolicyCard, load_card, ve
 from airl_mav.policy.greedy import GreedyPolicy, GreedySettings
 from airl_mav.policy.learned import load_learned
 from airl_mav.policy.runtime import RuntimeName
-from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.loading import profiles_dir
+from airl_mav.profiles.vehicle import VehicleProfile
 
 POLICIES: dict[str, tuple[str, Callable[[float], Policy]]] = {
     "greedy": (
@@ -56,15 +56,18 @@ class PolicyInfo:
         return None if self.card is None else self.card.macs
 
 
-def camera_refused(policy: PolicyInfo, camera: Camera) -> str | None:
-    """Return why a vehicle's camera cannot serve a policy, or None when it can, as far as is known.
+def camera_refused(policy: PolicyInfo, vehicle: VehicleProfile) -> str | None:
+    """Return why a vehicle's cameras cannot serve a policy, or None when they can, if it is known.
 
     Of a policy that is written in Python nothing is.
     """
+    camera = vehicle.camera
     if policy.card is not None:
-        return vehicle_mismatch(policy.card, camera)
+        return vehicle_mismatch(policy.card, camera, vehicle.cameras)
     if policy.program is None and camera.kind != "depth":
         return f"{camera.kind} camera; accepted: depth"
+    if policy.program is None and camera.yaw_deg != 0.0:
+        return f"camera with yaw_deg = {camera.yaw_deg:g}; accepted: 0, one that looks ahead"
     return None
 
 

@@ -229,10 +229,9 @@ class _Mount:
     """Where a camera sits on its vehicle."""
 
     def __init__(self, camera: Camera) -> None:
-        self._offset = np.array([camera.forward_m, 0.0, -camera.up_m])
-        self._turn = quat_to_matrix(
-            quat_from_euler(0.0, float(np.deg2rad(camera.pitch_up_deg)), 0.0)
-        )
+        self._offset = np.array([camera.forward_m, camera.right_m, -camera.up_m])
+        pitch, yaw = np.deg2rad(camera.pitch_up_deg), np.deg2rad(camera.yaw_deg)
+        self._turn = quat_to_matrix(quat_from_euler(0.0, float(pitch), float(yaw)))
 
     def pose(self, position: Vector, quaternion: Vector) -> CameraPose:
         """Return the pose of the camera of a vehicle at NED [m], body -> NED."""

@@ -58,7 +58,7 @@ class Ranging(ProfileModel):
 
 
 class Camera(ProfileModel):
-    """The camera, which looks ahead or all round."""
+    """A camera: the main one looks ahead or all round, further ones wherever they are mounted."""
 
     kind: CameraKind = Field(
         default="depth",
@@ -96,7 +96,17 @@ class Camera(ProfileModel):
     rate_hz: float = quantity("frames a second", "Hz", ge=1, le=125)
     forward_m: float = quantity("mount ahead of the centre of mass", "m", ge=-2, le=2)
     up_m: float = quantity("mount above the centre of mass", "m", ge=-2, le=2)
+    right_m: float = quantity(
+        "mount to the right of the centre of mass", "m", ge=-2, le=2, default=0.0
+    )
     pitch_up_deg: float = quantity("mount angle, positive looks up", "deg", ge=-90, le=90)
+    yaw_deg: float = quantity(
+        "mount heading, clockwise seen from above: 0 looks along the nose, 90 to the right",
+        "deg",
+        ge=-180,
+        le=180,
+        default=0.0,
+    )
     stereo: Stereo | None = Field(
         default=None,
         description="how depth is matched, of a depth camera with a pinhole; left out: depth"
@@ -128,7 +138,7 @@ class Camera(ProfileModel):
 
     @model_serializer(mode="wrap")
     def _without_the_default(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        # Profiles that say neither kind nor projection nor stereo matching keep their digests.
+        # Profiles that say nothing of what came later keep their digests.
         data: dict[str, Any] = dump(self)
         if self.kind == "depth":
             data.pop("kind", None)
@@ -136,6 +146,9 @@ class Camera(ProfileModel):
             data.pop("projection", None)
         if self.distortion == UNDISTORTED:
             data.pop("distortion", None)
+        for name in ("right_m", "yaw_deg"):
+            if getattr(self, name) == 0.0:
+                data.pop(name, None)
         if self.stereo is None:
             data.pop("stereo", None)
         if self.ranging is None:

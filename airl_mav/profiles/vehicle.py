@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, Strict, model_validator
+from pydantic import (
+    Field,
+    SerializerFunctionWrapHandler,
+    Strict,
+    model_serializer,
+    model_validator,
+)
 
 from airl_mav.core.constants import C_PER_MAH, GRAVITY_M_S2
 from airl_mav.core.errors import FieldError, UsageError
@@ -12,6 +18,7 @@ from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.frames import Geodetic
 from airl_mav.core.location import HOME
 from airl_mav.profiles.camera import Camera
+from airl_mav.profiles.further_cameras import FurtherCameras, check_rates, with_the_rate
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.parameters import SPECS, parameter_values
 from airl_mav.profiles.sensors import Sensors
@@ -248,6 +255,11 @@ class VehicleProfile(ProfileModel):
     battery: Battery
     power: Momentum | Regression = Field(discriminator="model", description="power model")
     camera: Camera
+    cameras: FurtherCameras = Field(
+        default_factory=dict,
+        description="further cameras by name, each a table as `camera`, triggered with that one:"
+        " their rate_hz is left out",
+    )
     sensors: Sensors
     estimation: Estimation | None = Field(
         default=None, description="error of the estimator on these sensors; absent = not known"
@@ -263,6 +275,24 @@ class VehicleProfile(ProfileModel):
     )
     px4: Px4 | None = Field(default=None, description="for --firmware px4 and px4-hitl")
     ardupilot: ArduPilot | None = Field(default=None, description="for --firmware ardupilot")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _triggered_together(cls, data: Any) -> Any:
+        return with_the_rate(data)
+
+    @model_serializer(mode="wrap")
+    def _without_unused(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        # Profiles of one camera keep their digests.
+        data: dict[str, Any] = dump(self)
+        if not self.cameras:
+            data.pop("cameras", None)
+        return data
+
+    @model_validator(mode="after")
+    def _one_rate(self) -> VehicleProfile:
+        check_rates(self.camera, self.cameras)
+        return self
 
     @model_validator(mode="after")
     def _hovers(self) -> VehicleProfile:

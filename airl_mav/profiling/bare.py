@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import itertools
 import math
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from airl_mav.camera.frame import Frame
+from airl_mav.camera.frame import Frame, FurtherImage
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.clock import WallClock, processor_time_us
 from airl_mav.core.progress import Bar
 from airl_mav.policy.actions import limited
 from airl_mav.policy.learned import LearnedPolicy, open_network
 from airl_mav.policy.observation import Kinematics, encode
-from airl_mav.policy.observation_spec import camera_mismatch
+from airl_mav.policy.observation_spec import ObservationSpec, SeenCamera, camera_mismatch
 from airl_mav.profiling.measurement import Recording
 from airl_mav.profiling.policy_under_test import PolicyUnderTest
 from airl_mav.profiling.request import ProfileRequest
@@ -107,16 +109,30 @@ def random_observations(
     """Return images of noise, as large as the camera's, and states of a level vehicle."""
     spec, lens = policy.card.observation, policy.camera
     if camera_mismatch(spec, lens) is not None:
-        fov = math.radians(spec.horizontal_fov_deg)
-        size = spec.width_px, spec.camera_rows
-        lens = Intrinsics.from_fov(*size, fov, spec.projection, spec.kind, spec.distortion)
+        lens = _lens_for(spec)
     rng = np.random.default_rng((request.seed, OBSERVATION_STREAM))
     level = np.array([1.0, 0.0, 0.0, 0.0])
-    brightest = 20_000 if lens.kind == "depth" else 256
+    others = {name: _lens_for(seen) for name, seen in spec.cameras.items()}
+
+    def noise(lens: Intrinsics) -> NDArray[Any]:
+        return rng.integers(0, 20_000 if lens.kind == "depth" else 256, lens.shape, lens.dtype)
+
+    def frame(k: int) -> Frame:
+        main = noise(lens)
+        further = {name: FurtherImage(noise(each), each) for name, each in others.items()}
+        return Frame(k, 0, main, lens, further=further)
+
     return [
         (
-            Frame(k, 0, rng.integers(0, brightest, lens.shape, lens.dtype), lens),
+            frame(k),
             Kinematics(rng.normal(0.0, 5.0, 3), rng.normal(0.0, 2.0, 3), level),
         )
         for k in range(OBSERVATIONS)
     ]
+
+
+def _lens_for(seen: ObservationSpec | SeenCamera) -> Intrinsics:
+    """Return a camera whose images are as large as the network's."""
+    fov = math.radians(seen.horizontal_fov_deg)
+    size = seen.width_px, seen.camera_rows
+    return Intrinsics.from_fov(*size, fov, seen.projection, seen.kind, seen.distortion)

@@ -156,6 +156,7 @@ def _fly(
                 guard=ThreadGuard(clock),
                 compensator=mission.compensator,
                 mount_pitch_up_rad=mission.mount_pitch_up_rad,
+                mount_yaw_rad=mission.mount_yaw_rad,
             )
         during = link.take_exchanges()
         # `stop` is set by now: it ends the flight.

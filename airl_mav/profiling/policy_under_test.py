@@ -93,7 +93,7 @@ def open_policy(request: ProfileRequest) -> Iterator[PolicyUnderTest]:
 def _vehicle_for(card: PolicyCard, vehicles: dict[str, VehicleProfile]) -> str:
     """Return the first vehicle whose camera fits a policy. Raises FieldError if none does."""
     for name, vehicle in vehicles.items():
-        reason = vehicle_mismatch(card, vehicle.camera)
+        reason = vehicle_mismatch(card, vehicle.camera, vehicle.cameras)
         if reason is None:
             return name
     raise FieldError("vehicle", name, problem=reason or "")

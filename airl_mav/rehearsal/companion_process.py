@@ -127,6 +127,7 @@ class Missions:
                     latency=latency,
                     compensator=carries,
                     mount_pitch_up_rad=math.radians(self._scenario.vehicle.camera.pitch_up_deg),
+                    mount_yaw_rad=math.radians(self._scenario.vehicle.camera.yaw_deg),
                     decided=decided,
                 )
                 used = use.end()

@@ -102,7 +102,8 @@ def aircraft_of(asked: StandAloneVehicle) -> tuple[VehicleProfile, float]:
     """
     vehicle, computer = equipped(asked.vehicle, asked.computer, asked.payload)
     check_spread(vehicle, asked.spread)
-    check_noise(vehicle.camera, asked.sensors, asked.faults)
+    further = vehicle.cameras.values()
+    check_noise(vehicle.camera, asked.sensors, asked.faults, further=further)
     check_fitted(vehicle.sensors, asked.faults)
     return vehicle, computer.onboard_watts
 
@@ -121,7 +122,7 @@ def episode_of(
         UsageError: No arena can be made of the seed, or it cannot be drawn as asked.
     """
     spec = load_profile("arenas", asked.arena, ArenaSpec)
-    check_renderer(vehicle.camera, asked.renderer, spec)
+    check_renderer(vehicle.camera, asked.renderer, spec, vehicle.cameras.values())
     width_m = vehicle.body.width_m
     arena = generate(spec, asked.seed, name=asked.arena, vehicle_width_m=width_m)
     return EpisodeSetup(vehicle, arena, asked.seed, asked, computer_w), arena.goal_point

@@ -29,10 +29,13 @@ TURNED_OVER_US = 20_000
 class TakingCamera:
     """Takes pictures, one ray a pixel, with the table `imaging` where the camera has one."""
 
-    def __init__(self, camera: Camera) -> None:
-        """Take the camera of a vehicle profile; it sits on the vehicle as it does there."""
+    def __init__(self, camera: Camera, name: str = "") -> None:
+        """Take the camera of a vehicle profile; it sits on the vehicle as it does there.
+
+        `name` is that of a further camera.
+        """
         self._camera, self._intrinsics = camera, Intrinsics.of(camera)
-        self._forming = None if camera.imaging is None else ImageFormation(camera)
+        self._forming = None if camera.imaging is None else ImageFormation(camera, name)
         self._mount = Mount.of(camera)
 
     def __call__(self, arena: Arena, elapsed_us: int, motion: Motion, seed: int) -> Pixels:

@@ -7,7 +7,8 @@ A learned policy is asked again what it makes of that.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,7 +29,14 @@ from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.policy.action_sets import commands, discrete_actions
 from airl_mav.policy.layouts import encode_layout
 from airl_mav.policy.learned import LearnedPolicy, load_learned
-from airl_mav.policy.observation import Earlier, InFlight, Kinematics, Observation, observe
+from airl_mav.policy.observation import (
+    Earlier,
+    InFlight,
+    Kinematics,
+    Observation,
+    View,
+    observe,
+)
 from airl_mav.policy.observation_spec import MOST_FRAMES
 from airl_mav.policy.registry import find_policy
 from airl_mav.prediction.compensator import Compensator
@@ -119,6 +127,13 @@ def seen_decisions(
     if path is None or not len(path) or any(name not in stamps for name in needed):
         return
     lens = _Lens(arena, PolicyCamera.of(vehicle.camera), path, record.started_us)
+    # Those that the network asks for: it is asked again only on a vehicle that has them.
+    names = () if again is None else again.policy.card.observation.cameras
+    further = {
+        name: _Further(_Lens(arena, PolicyCamera.of(camera), path, record.started_us))
+        for name, camera in vehicle.cameras.items()
+        if name in names
+    }
     pilot, watchdog = run.info.config.get("pilot", {}), run.info.config.get("watchdog", {})
     companion = _Companion(vehicle, lens.camera, compensates=bool(pilot.get("compensate")))
     hover_s, lasts_s = watchdog.get("hover_after_s"), pilot.get("hold_s", 0.0)
@@ -128,7 +143,8 @@ def seen_decisions(
         if NO_STAMP in (captured, began, ready, sent):
             continue
         image, state = lens.image(captured), _telemetry(stamps, path, began)
-        seen = companion.observe(image, state, record.goal, began - captured, began)
+        views = {name: each.view(captured) for name, each in further.items()}
+        seen = companion.observe(image, state, record.goal, began - captured, began, views)
         setpoint = np.asarray(stamps["setpoint"][number], np.float64)
         scores = same = None
         if again is not None and policy is not None:
@@ -160,6 +176,20 @@ class _Lens:
         return expose(self.arena, centers, lens, range_m, eye, attitude)
 
 
+class _Further:
+    """A further camera along a recorded path, and what it has shown the decisions so far."""
+
+    def __init__(self, lens: _Lens) -> None:
+        self._lens = lens
+        self._earlier: deque[NDArray[Any]] = deque(maxlen=MOST_FRAMES - 1)
+
+    def view(self, time_us: int) -> View:
+        """Return what a decision sees of an image that was taken at a time; keep it."""
+        image, earlier = self._lens.image(time_us), tuple(self._earlier)
+        self._earlier.appendleft(image)
+        return View(image, self._lens.camera.intrinsics, earlier)
+
+
 class _Companion:
     """What a companion keeps from one decision to the next, as `companion.pilot` does."""
 
@@ -182,6 +212,7 @@ class _Companion:
         goal: Goal,
         age_us: int,
         now_us: int,
+        further: Mapping[str, View],
     ) -> Observation:
         """Return what the policy sees: what is, or what will be when its action is sent."""
         age = np.array([age_us])
@@ -195,7 +226,7 @@ class _Companion:
         self._earlier = ((image, state), *earlier)[: MOST_FRAMES - 1]
         where = np.asarray(goal, np.float64)
         in_flight = InFlight(told.command, told.latency_s, told.age_s)
-        return observe(image, self._intrinsics, state, where, in_flight, earlier)
+        return observe(image, self._intrinsics, state, where, in_flight, earlier, further)
 
     def decided(
         self, setpoint: NDArray[np.float64], t2_us: int, sent_us: int, stops_us: int | None

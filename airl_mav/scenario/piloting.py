@@ -5,6 +5,7 @@ What the companion needs of a scenario's resolution; imports no simulator.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import asdict
 from typing import Any
 
@@ -19,6 +20,7 @@ from airl_mav.latency.source import select_injection
 from airl_mav.policy.actions import Policy
 from airl_mav.policy.registry import PolicyInfo, load_policy
 from airl_mav.profiles.computer import load_computer
+from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.model import Decisions, Lateness, LevelName, PilotSettings, WatchdogSettings
 
 ACTION_STREAM = 1
@@ -72,6 +74,25 @@ def decide_piloting(
             f"more than the hold time, {pilot.hold_s:g} s, or every decision is overdue",
         )
     return pilot, asked.watchdog.model_copy(update={"hover_after_s": hover_s})
+
+
+def check_compensated(pilot: PilotSettings, policy: PolicyInfo, vehicle: VehicleProfile) -> None:
+    """Raise FieldError for a policy that sees by further cameras, where latency is compensated.
+
+    Their images are not carried forward.
+    """
+    seen: Iterable[str] = ()
+    if policy.card is not None:
+        seen = policy.card.observation.cameras
+    elif policy.program is not None:
+        seen = vehicle.cameras
+    if pilot.compensate and (names := ", ".join(seen)):
+        raise FieldError(
+            "compensate",
+            True,
+            problem=f"policy {policy.name} sees by further cameras ({names}), whose images are not"
+            " carried forward; accepted: no compensation",
+        )
 
 
 def check_goal_height(policy: PolicyInfo, goal: Goal, field: str, asked: object) -> None:

@@ -23,6 +23,7 @@ from airl_mav.scenario.checks import (
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.piloting import (
     NATIVE_T2_US,
+    check_compensated,
     check_goal_height,
     check_quota,
     decide_piloting,
@@ -48,17 +49,19 @@ def resolve(scenario: Scenario) -> ResolvedScenario:
     pilot, watchdog = decide_piloting(scenario, policy, GOAL_RADIUS_M)
     vehicle, computer = equipped(scenario.vehicle, scenario.computer, scenario.payload)
     check_spread(vehicle, scenario.spread)
-    check_noise(vehicle.camera, scenario.sensors, scenario.faults)
+    further = vehicle.cameras.values()
+    check_noise(vehicle.camera, scenario.sensors, scenario.faults, further=further)
     check_fitted(vehicle.sensors, scenario.faults)
-    if reason := camera_refused(policy, vehicle.camera):
+    if reason := camera_refused(policy, vehicle):
         raise FieldError(
             "policy", scenario.policy, problem=f"does not fit vehicle {scenario.vehicle}: {reason}"
         )
+    check_compensated(pilot, policy, vehicle)
     arena = load_profile("arenas", scenario.arena, ArenaSpec)
     injection = select_injection(
         scenario.latency, computer, scenario.workload, policy_sha256=policy.sha256, macs=policy.macs
     )
-    check_renderer(vehicle.camera, scenario.renderer, arena)
+    check_renderer(vehicle.camera, scenario.renderer, arena, further)
     check_quota(scenario, injection, scenario.level)
     resolved = ResolvedScenario(
         scenario=scenario,

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
+from airl_mav.core.errors import FieldError
 from airl_mav.envs.evaluation import OUTCOMES, EpisodeResult, mean_of_successes
 from airl_mav.flight.judge import Outcome
 from airl_mav.policy.runtime import outputs_of
@@ -79,6 +80,9 @@ def training_of(config: SweepConfig, trial: Trial) -> TrainingConfig:
 def size_of(config: SweepConfig, trial: Trial) -> Size:
     """Return the size of a trial's network, as it flies."""
     environment = config.training.environment
+    if environment.cameras:
+        names = ", ".join(environment.cameras)
+        raise FieldError("training.environment.cameras", names, "none in a sweep")
     camera = environment.camera.of(load_vehicle(environment.vehicle).camera)
     return template_size(
         trial.layers,

@@ -33,7 +33,7 @@ from airl_mav.training.onnx_export import (
     random_inputs,
     random_memory,
 )
-from airl_mav.training.recurrent import RecurrentNetwork
+from airl_mav.training.recurrent import RecurrentNetwork, RecurrentOfSeveral
 
 DEPTH = "depth"
 """Key of the image where the camera gives depth."""
@@ -134,6 +134,7 @@ def network_of(model: BaseAlgorithm) -> nn.Module:
     keys = tuple(sorted(policy.observation_space.spaces))
     image = next((key for key in keys if key in KINDS), DEPTH)
     usual = set(keys) == {image, *VECTORS}
+    further = _further_keys(policy.observation_space)
     network: Callable[[nn.Module], nn.Module]
     if usual or set(keys) == {image, *VECTORS, IN_FLIGHT}:
         network = _Network if usual else _ToldNetwork
@@ -141,6 +142,12 @@ def network_of(model: BaseAlgorithm) -> nn.Module:
             # In the order in which the layout has them.
             told = () if usual else (IN_FLIGHT,)
             network = partial(_AnyNetwork, keys=(image, *VECTORS, *told))
+    elif further and set(keys) - set(further) in (
+        {image, *VECTORS},
+        {image, *VECTORS, IN_FLIGHT},
+    ):
+        told = (IN_FLIGHT,) if IN_FLIGHT in keys else ()
+        network = partial(_AnyNetwork, keys=(image, *VECTORS, *told, *further))
     else:
         network = partial(_AnyNetwork, keys=keys)
     if hasattr(policy, "quantile_net"):
@@ -163,15 +170,24 @@ def network_of(model: BaseAlgorithm) -> nn.Module:
         hidden = policy.mlp_extractor.policy_net
         extractor = policy.pi_features_extractor
         if hasattr(policy, "lstm_actor"):
-            if not usual:
+            several = bool(further) and set(keys) == {image, *VECTORS, *further}
+            if not (usual or several):
                 raise UsageError(
                     f"a network with a memory of its own takes {', '.join(keys)}; accepted:"
                     f" {', '.join((image, *VECTORS))}"
                 )
             head = nn.Sequential(hidden, policy.action_net, last)
-            return RecurrentNetwork(_Actor(policy, extractor), policy.lstm_actor, head, image)
+            parts = (_Actor(policy, extractor), policy.lstm_actor, head, image)
+            return RecurrentOfSeveral(*parts, further) if several else RecurrentNetwork(*parts)
         return network(_Actor(policy, extractor, hidden, policy.action_net, last))
     raise UsageError(f"{type(model).__name__}: its {type(policy).__name__} cannot be exported")
+
+
+def _further_keys(seen: spaces.Space[Any]) -> tuple[str, ...]:
+    """Return the keys of the images of further cameras in an observation space, sorted."""
+    parts = seen.spaces if isinstance(seen, spaces.Dict) else {}
+    found = (key for key, part in parts.items() if len(part.shape or ()) == 3)
+    return tuple(sorted(key for key in found if key not in KINDS))
 
 
 def check_spaces(model: BaseAlgorithm, spec: ObservationSpec, actions: ActionSpec) -> None:
@@ -180,16 +196,20 @@ def check_spaces(model: BaseAlgorithm, spec: ObservationSpec, actions: ActionSpe
     wanted = {key: (box.shape, box.dtype) for key, box in boxes(spec).items()}
     accepted = ", ".join(f"{k} {np.dtype(kind)} {shape}" for k, (shape, kind) in wanted.items())
     parts = dict(seen.spaces) if isinstance(seen, spaces.Dict) else {"not a Dict": seen}
+    images = {spec.kind, *spec.further_keys.values()}
     fits = parts.keys() == wanted.keys() and all(
         isinstance(part, spaces.Box)
         and part.shape == wanted[key][0]
         # SB3 turns all floats into float32.
-        and (part.dtype == np.uint8 if key == spec.kind else part.dtype.kind == "f")
+        and (part.dtype == np.uint8 if key in images else part.dtype.kind == "f")
         for key, part in parts.items()
     )
     if not fits:
         found = ", ".join(f"{key} {part.dtype} {part.shape}" for key, part in parts.items())
-        raise UsageError(f"observation space {found}; accepted with this layout: {accepted}")
+        told = f"observation space {found}; accepted with this layout: {accepted}"
+        if not spec.cameras and (others := _further_keys(seen)):
+            told += f". What camera {', '.join(others)} is of is told by --like CONFIGURATION"
+        raise UsageError(told)
     space, count = model.action_space, discrete_actions(actions)
     if count is not None:
         if not (isinstance(space, spaces.Discrete) and space.n == count and space.start == 0):

@@ -13,6 +13,7 @@ from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import validated
 from airl_mav.core.plugins import names_code
 from airl_mav.core.provenance import package_versions
+from airl_mav.envs.sight import further_seen
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.flight.judge import GOAL_RADIUS_M
 from airl_mav.policy.action_sets import PAPER_SPEED_M_S, ActionSetName, ActionSpec
@@ -31,7 +32,7 @@ FLOWN = ("hold_s", "goal_radius_m", "altitude_m", "hover_after_s")
 
 SEEN = (
     *("layout", "frames", "kind", "projection", "horizontal_fov_deg", "distortion", "range_m"),
-    "goal_height",
+    *("goal_height", "cameras"),
 )
 """What a policy sees but for the image's size: fields of the request and of a card."""
 
@@ -45,6 +46,7 @@ DEFAULTS: dict[str, Any] = {
     "distortion": UNDISTORTED,
     "range_m": 20.0,
     "goal_height": False,
+    "cameras": {},
     "actions": "arc-25",
     "max_speed_m_s": PAPER_SPEED_M_S,
     "hold_s": PilotSettings.hold_s,
@@ -244,7 +246,8 @@ def _environment(name: str) -> EnvironmentSpec:
 
 def _known_of(spec: EnvironmentSpec) -> dict[str, Any]:
     """Return what an environment says of the policies that are made in it."""
-    camera = spec.camera.of(load_vehicle(spec.vehicle).camera)
+    vehicle = load_vehicle(spec.vehicle)
+    camera = spec.camera.of(vehicle.camera)
     return {
         "layout": spec.layout,
         "image": f"{spec.image_width_px}x{spec.image_height_px}",
@@ -255,6 +258,7 @@ def _known_of(spec: EnvironmentSpec) -> dict[str, Any]:
         "distortion": camera.distortion,
         "range_m": camera.range_m,
         "goal_height": spec.goal_height,
+        "cameras": further_seen(spec, vehicle),
         "actions": spec.actions,
         "max_speed_m_s": spec.max_speed_m_s,
         **{name: getattr(spec.episode, name) for name in FLOWN},

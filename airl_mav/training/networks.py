@@ -84,26 +84,39 @@ class ImageExtractor(BaseFeaturesExtractor):
     """Convolutions over the image, joined with `velocity`, `goal` and others.
 
     The image is `depth`, `rgb` or `grey` (n, channels, height, width). It comes in scaled
-    to 0..1, which stable-baselines3 does with uint8 images.
+    to 0..1, which stable-baselines3 does with uint8 images. Images of further cameras have
+    convolutions of their own, of the same kind.
     """
 
     def __init__(self, observation_space: spaces.Dict, spec: NetworkSpec) -> None:
         self.image = image_key(observation_space.spaces)
-        shape = observation_space[self.image].shape
-        assert shape is not None  # noqa: S101 (a Box has a shape)
-        vectors = [key for key in VECTORS if key in observation_space.spaces]
-        vectors += [key for key in observation_space.spaces if key not in (self.image, *VECTORS)]
+        shapes = {key: part.shape or () for key, part in observation_space.spaces.items()}
+        images = [self.image, *further_images(observation_space)]
+        vectors = [key for key in VECTORS if key in shapes]
+        vectors += [key for key in shapes if key not in (*images, *VECTORS)]
         numbers = sum(spaces.flatdim(observation_space[key]) for key in vectors)
-        super().__init__(observation_space, flat_size(spec, *shape[1:]) + numbers)
+        numbers += sum(flat_size(spec, *shapes[key][1:]) for key in images)
+        super().__init__(observation_space, numbers)
         self.vectors = vectors
-        self.convolutions = _convolution_stack(spec, *shape[:2])
+        self.convolutions = _convolution_stack(spec, *shapes[self.image][:2])
+        self.further = nn.ModuleDict(
+            {key: _convolution_stack(spec, *shapes[key][:2]) for key in images[1:]}
+        )
 
     def forward(self, observations: dict[str, torch.Tensor]) -> torch.Tensor:
         """Return the features (n, features_dim)."""
         flat = self.convolutions(observations[self.image])
+        others = [stack(observations[key]) for key, stack in self.further.items()]
         # Under autocast the convolutions give bfloat16, the vectors are float32.
         vectors = [observations[key].to(flat.dtype) for key in self.vectors]
-        return torch.cat([flat, *vectors], dim=1)
+        return torch.cat([flat, *others, *vectors], dim=1)
+
+
+def further_images(observation_space: spaces.Dict) -> list[str]:
+    """Return the keys of the images of further cameras, sorted."""
+    main = image_key(observation_space.spaces)
+    found = (key for key, part in observation_space.spaces.items() if len(part.shape or ()) == 3)
+    return sorted(key for key in found if key != main)
 
 
 DepthExtractor = ImageExtractor

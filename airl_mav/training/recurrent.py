@@ -6,6 +6,7 @@ sums, any number of rows, and the memory has its rows first, as everything else 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -75,13 +76,41 @@ class RecurrentNetwork(nn.Module):
         cell: torch.Tensor,
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Return the outputs (n, k), and hidden and cell (n, layers, units) after the decision."""
-        found = self.features({self.image: image, VELOCITY: velocity, GOAL: goal})
+        seen = {self.image: image, VELOCITY: velocity, GOAL: goal}
+        return self.decided(seen, hidden, cell)
+
+    def decided(
+        self, seen: dict[str, torch.Tensor], hidden: torch.Tensor, cell: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return what `forward` does, of observations by key."""
+        found = self.features(seen)
         hiddens, cells = [], []
         for layer, step in enumerate(self.steps):
             found, kept = step(found, hidden[:, layer], cell[:, layer])
             hiddens.append(found)
             cells.append(kept)
         return self.head(found), torch.stack(hiddens, dim=1), torch.stack(cells, dim=1)
+
+
+class RecurrentOfSeveral(RecurrentNetwork):
+    """The same of a network that sees by further cameras, whose images follow the goal."""
+
+    def __init__(
+        self,
+        features: nn.Module,
+        lstm: nn.LSTM,
+        head: nn.Module,
+        image: str,
+        further: Sequence[str],
+    ) -> None:
+        """Take the parts as `RecurrentNetwork`, and the keys of the further images."""
+        super().__init__(features, lstm, head, image)
+        self.keys = (image, VELOCITY, GOAL, *further)
+
+    def forward(self, *arrays: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return the outputs (n, k), and hidden and cell (n, layers, units) after the decision."""
+        *seen, hidden, cell = arrays
+        return self.decided(dict(zip(self.keys, seen, strict=True)), hidden, cell)
 
 
 class GreedyDecisions:

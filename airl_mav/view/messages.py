@@ -156,7 +156,7 @@ class ArenaShown(Message):
 
 
 class VehicleShape(Message):
-    """What a vehicle looks like, and where its camera looks [m, deg]."""
+    """What a vehicle looks like, and where its main camera looks [m, deg]."""
 
     arm_forward_m: float
     arm_right_m: float
@@ -165,6 +165,8 @@ class VehicleShape(Message):
     camera_forward_m: float
     camera_up_m: float
     camera_pitch_up_deg: float
+    camera_right_m: float = 0.0
+    camera_yaw_deg: float = 0.0
     camera_projection: Projection
     camera_fov_deg: float
     """Horizontal."""
@@ -187,6 +189,8 @@ class VehicleShape(Message):
             camera_forward_m=camera.forward_m,
             camera_up_m=camera.up_m,
             camera_pitch_up_deg=camera.pitch_up_deg,
+            camera_right_m=camera.right_m,
+            camera_yaw_deg=camera.yaw_deg,
             camera_projection=camera.projection,
             camera_fov_deg=camera.horizontal_fov_deg,
             camera_aspect=camera.width_px / camera.height_px,

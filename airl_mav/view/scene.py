@@ -290,7 +290,8 @@ class FlightScene:
             self._build_camera(shape)
 
     def _build_camera(self, shape: VehicleShape) -> None:
-        pitch = quat_from_euler(0.0, math.radians(shape.camera_pitch_up_deg), 0.0)
+        pitch, yaw = map(math.radians, (shape.camera_pitch_up_deg, shape.camera_yaw_deg))
+        turn = quat_from_euler(0.0, pitch, yaw)
         if shape.camera_projection == "cylindrical":
             # It looks all round: its picture hangs unrolled above the vehicle, ahead in the middle.
             self._camera = self._add(
@@ -313,8 +314,8 @@ class FlightScene:
             scale=FRUSTUM_M,
             thickness=0.012,
             color=FLOWN,
-            position=(shape.camera_forward_m, 0.0, -shape.camera_up_m),
-            wxyz=quat_multiply(pitch, FRD_FROM_OPTICAL),
+            position=(shape.camera_forward_m, shape.camera_right_m, -shape.camera_up_m),
+            wxyz=quat_multiply(turn, FRD_FROM_OPTICAL),
         )
 
     # --- every time

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Protocol
 
 from airl_mav.camera.intrinsics import Intrinsics
@@ -10,7 +11,7 @@ from airl_mav.core.errors import FieldError
 from airl_mav.core.plugins import CAMERAS, load_part, reference
 from companion.camera import FrameSource, open_camera
 from companion.cameras.driver import CameraThread, DepthCamera
-from companion.cameras.fitting import Fitting, check_coverage
+from companion.cameras.fitting import Fitting, Lens, check_coverage
 
 REALSENSE, OAK_D, ROS2, ROSBAG = "realsense", "oak-d", "ros2", "rosbag"
 """Drivers that are shipped: words before a colon."""
@@ -42,7 +43,13 @@ class OpenCamera(FrameSource, Protocol):
         ...
 
 
-def open_named_camera(name: str, clock: Clock, wanted: Intrinsics, whose: str) -> OpenCamera:
+def open_named_camera(
+    name: str,
+    clock: Clock,
+    wanted: Intrinsics,
+    whose: str,
+    further: Mapping[str, Intrinsics] | None = None,
+) -> OpenCamera:
     """Open a camera by its name.
 
     Args:
@@ -52,6 +59,8 @@ def open_named_camera(name: str, clock: Clock, wanted: Intrinsics, whose: str) -
         clock: The companion's, for the stamps.
         wanted: What images of a driver are made into; an address sends what it sends.
         whose: Whose camera `wanted` is: "vehicle quad".
+        further: What a driver's further images are made into, by name; those that it does not give
+            are missing in its frames.
 
     Raises:
         FieldError: There is no such camera, it sees too little of what is wanted, or it gives
@@ -59,6 +68,26 @@ def open_named_camera(name: str, clock: Clock, wanted: Intrinsics, whose: str) -
     """
     if "://" in name:
         return open_camera(name, clock)
+    _check_fits(name, wanted, whose)
+    camera = _driver(name, clock)
+    lenses: Mapping[str, Lens] = getattr(camera, "lenses", {})
+    given = {each: lens for each, lens in (further or {}).items() if each in lenses}
+    fitting = Fitting(camera.lens, wanted)
+    try:
+        check_coverage(name, camera.lens, fitting, whose)
+        others = {}
+        for each, lens in given.items():
+            _check_fits(name, lens, f"{whose} ({each})")
+            others[each] = Fitting(lenses[each], lens)
+            check_coverage(name, lenses[each], others[each], f"{whose} ({each})")
+    except FieldError:
+        camera.close()
+        raise
+    return CameraThread(name, camera, clock, fitting, others)
+
+
+def _check_fits(name: str, wanted: Intrinsics, whose: str) -> None:
+    """Raise FieldError for a camera whose images no driver gives."""
     if wanted.kind != "depth":
         raise FieldError(
             "camera",
@@ -66,14 +95,6 @@ def open_named_camera(name: str, clock: Clock, wanted: Intrinsics, whose: str) -
             problem=f"drivers give depth images, the camera of {whose} is of kind {wanted.kind!r};"
             " accepted: tcp://HOST:PORT or ipc://PATH of a publisher of such images",
         )
-    camera = _driver(name, clock)
-    fitting = Fitting(camera.lens, wanted)
-    try:
-        check_coverage(name, camera.lens, fitting, whose)
-    except FieldError:
-        camera.close()
-        raise
-    return CameraThread(name, camera, clock, fitting)
 
 
 def _driver(name: str, clock: Clock) -> DepthCamera:

@@ -10,12 +10,13 @@ from __future__ import annotations
 import sys
 import threading
 import traceback
+from collections.abc import Mapping
 from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.camera.frame import Frame
+from airl_mav.camera.frame import Frame, FurtherImage
 from airl_mav.core.clock import Clock
 from airl_mav.core.constants import US_PER_S
 from companion.camera import ReceivedFrame
@@ -66,10 +67,15 @@ class DepthImage(NamedTuple):
     """Time since the exposure, by the driver's stamps [µs]; 0 where it has none."""
     number: int | None = None
     """Counts up by one per image that the camera takes; None where the camera does not count."""
+    further: Mapping[str, NDArray[np.uint16]] = {}
+    """Images that further cameras took at the same moment, by name; see `lenses`."""
 
 
 class DepthCamera(Protocol):
-    """A camera of the companion computer's."""
+    """A camera of the companion computer's.
+
+    One that returns further images also has `lenses`: a `Lens` for each, by name.
+    """
 
     @property
     def lens(self) -> Lens:
@@ -101,7 +107,14 @@ def missing_between(last: int | None, number: int | None) -> int:
 class CameraThread:
     """The newest image of a driver, as a frame of the wanted size. Implements `FrameSource`."""
 
-    def __init__(self, name: str, camera: DepthCamera, clock: Clock, fitting: Fitting) -> None:
+    def __init__(
+        self,
+        name: str,
+        camera: DepthCamera,
+        clock: Clock,
+        fitting: Fitting,
+        further: Mapping[str, Fitting] | None = None,
+    ) -> None:
         """Start to read.
 
         Args:
@@ -109,12 +122,14 @@ class CameraThread:
             camera: The driver; closed by `close`.
             clock: The companion's, for the stamps.
             fitting: What makes its images those that the policy was trained with.
+            further: The same of further images, by name; others are left out.
         """
         self.failure: str | None = None
         """Why no more images come, once the driver has raised."""
         self.dropped = 0
         """Images that the camera took and the driver never returned, by their numbers."""
         self._name, self._camera, self._clock, self._fitting = name, camera, clock, fitting
+        self._further = further or {}
         self._newest: ReceivedFrame | None = None
         self._changed = threading.Condition()
         self._ended = threading.Event()
@@ -154,7 +169,13 @@ class CameraThread:
                 last_number = image.number
                 # Fitted before the stamp of arrival: it is part of how long a frame takes.
                 depth_mm = self._fitting.fit(image.depth_mm)
-                frame = Frame(sequence, taken_us, depth_mm, self._fitting.wanted)
+                if missing := self._further.keys() - image.further.keys():
+                    raise ValueError(f"an image without those of {', '.join(sorted(missing))}")
+                further = {
+                    called: FurtherImage(fitting.fit(image.further[called]), fitting.wanted)
+                    for called, fitting in self._further.items()
+                }
+                frame = Frame(sequence, taken_us, depth_mm, self._fitting.wanted, further=further)
                 received = ReceivedFrame(frame, self._clock.time_us())
                 with self._changed:
                     self._newest = received

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing import Pipe
@@ -76,6 +76,7 @@ class CameraProcess:
         noise: SensorNoise | None,
         seed: int,
         renderer: Renderer,
+        further: Mapping[str, Camera] | None = None,
     ) -> SlowCamera:
         """Return an episode's camera when it has taken a first picture; see `SimulatedCamera`.
 
@@ -86,7 +87,7 @@ class CameraProcess:
         """
         if self._process is None:
             self._start()
-        self.send((camera, arena, start_us, noise, seed, renderer))
+        self.send((camera, arena, start_us, noise, seed, renderer, further))
         while self.receive() is not None:
             pass  # A frame of the episode before was still being taken.
         return SlowCamera(self, start_us)

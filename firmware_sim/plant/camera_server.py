@@ -1,9 +1,9 @@
-"""The vehicle's camera: its schedule, its images, and their publication."""
+"""The vehicle's cameras: their schedule, their images, and their publication."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.exposure import exposure_by
-from airl_mav.camera.frame import Frame
+from airl_mav.camera.frame import Frame, FurtherImage
 from airl_mav.camera.imaging import ImageFormation
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.noise import noise_of, noisy_frame
@@ -25,8 +25,51 @@ from airl_mav.profiles.conditions import SensorNoise
 from firmware_sim.plant.sensors import Rate
 
 
+class _Eye:
+    """One of a vehicle's cameras: what it sees when it is triggered."""
+
+    def __init__(
+        self, camera: Camera, arena: Arena, noise: SensorNoise, renderer: Renderer, name: str = ""
+    ) -> None:
+        """Take the camera, what it sees, conditions, what draws, and a further camera's name."""
+        self._expose = exposure_by(renderer, name)
+        self._noise = noise_of(camera, noise, name)
+        self._forming = ImageFormation(camera, name) if camera.imaging is not None else None
+        self.intrinsics = Intrinsics.of(camera)
+        self._mount, self._max_range = Mount.of(camera), camera.range_m
+        self._arena = arena
+
+    def restart(self) -> None:
+        """Begin an episode."""
+        if self._forming is not None:
+            self._forming.restart()
+
+    def take(self, elapsed_us: int, motion: Motion, seed: int, number: int) -> FurtherImage:
+        """Return an image of an episode.
+
+        Args:
+            elapsed_us: Time since the episode's start [µs].
+            motion: How the vehicle moves then.
+            seed: Of the episode.
+            number: The image's in the episode, by the rate.
+        """
+        image: NDArray[Any]
+        jpeg = None
+        if self._forming is not None:
+            image, jpeg = self._forming.take(self._arena, elapsed_us, motion, seed, number)
+        else:
+            at, attitude = camera_pose(motion.position, motion.quaternion, self._mount)
+            centers = self._arena.centers_at(elapsed_us)
+            image = self._expose(
+                self._arena, centers, self.intrinsics, self._max_range, at, attitude
+            )
+        if self._noise is not None:
+            image = noisy_frame(image, self._noise, seed, number)
+        return FurtherImage(image, self.intrinsics, jpeg)
+
+
 class SimulatedCamera:
-    """Takes frames of an arena at a fixed rate, from a vehicle's pose."""
+    """Takes frames of an arena at a fixed rate, from a vehicle's pose: images of all cameras."""
 
     def __init__(
         self,
@@ -36,32 +79,36 @@ class SimulatedCamera:
         noise: SensorNoise | None = None,
         seed: int = 0,
         renderer: Renderer = "raycast",
+        further: Mapping[str, Camera] | None = None,
     ) -> None:
-        """Make the camera of a vehicle profile.
+        """Make the cameras of a vehicle profile.
 
         Args:
-            camera: The camera.
+            camera: The main camera.
             arena: What it sees.
             start_us: When the first frame is due [µs].
             noise: Conditions that its images are taken in; None: the usual ones.
             seed: Of that noise.
             renderer: What draws its images.
+            further: Those that are triggered with it, by name; None: there are none.
         """
-        self._expose = exposure_by(renderer)
-        self._noise = noise_of(camera, noise or SensorNoise())
-        self._forming = ImageFormation(camera) if camera.imaging is not None else None
+        asked = noise or SensorNoise()
+        self._main = _Eye(camera, arena, asked, renderer)
+        self._further = {
+            name: _Eye(each, arena, asked, renderer, name) for name, each in (further or {}).items()
+        }
         self._seed = seed
-        self._intrinsics = Intrinsics.of(camera)
-        self._mount = Mount.of(camera)
-        self._rate_hz, self._max_range = camera.rate_hz, camera.range_m
-        self._arena = arena
+        self._rate_hz = camera.rate_hz
         self._sequence = 0
         # The first picture loads or compiles the kernels: better here than in flight.
         at_rest = Motion.at_rest(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
-        self._look(0, at_rest.position, at_rest.quaternion)
-        if self._forming is not None:
-            self._forming.take(arena, 0, at_rest, seed, 0)
+        for each in self._eyes:
+            each.take(0, at_rest, seed, 0)
         self.restart(start_us)
+
+    @property
+    def _eyes(self) -> tuple[_Eye, ...]:
+        return (self._main, *self._further.values())
 
     def restart(self, time_us: int) -> None:
         """Begin an episode, and with it its moving obstacles: the next frame is due at `time_us`.
@@ -71,8 +118,8 @@ class SimulatedCamera:
         self._start_us = self.next_us = time_us
         """`next_us`: simulated time from which on the next frame is due [µs]."""
         self._rate = Rate(self._rate_hz)
-        if self._forming is not None:
-            self._forming.restart()
+        for each in self._eyes:
+            each.restart()
 
     def offer(self, time_us: int, motion: Motion, publish: Callable[[Frame], None]) -> None:
         """Take a frame that is due and hand it to `publish`; see `take`."""
@@ -94,24 +141,12 @@ class SimulatedCamera:
         elapsed_us = time_us - self._start_us
         self._rate.due(elapsed_us)
         self.next_us = self._start_us + math.ceil(self._rate.next_us)
-        image: NDArray[Any]
-        jpeg = None
-        if self._forming is not None:
-            image, jpeg = self._forming.take(
-                self._arena, elapsed_us, motion, self._seed, self._rate.period
-            )
-        else:
-            image = self._look(elapsed_us, motion.position, motion.quaternion)
-        if self._noise is not None:
-            image = noisy_frame(image, self._noise, self._seed, self._rate.period)
-        frame = Frame(self._sequence, time_us, image, self._intrinsics, jpeg)
+        seen, period = (elapsed_us, motion, self._seed), self._rate.period
+        main = self._main.take(*seen, period)
+        further = {name: each.take(*seen, period) for name, each in self._further.items()}
+        frame = Frame(*(self._sequence, time_us, main.image, main.intrinsics, main.jpeg), further)
         self._sequence += 1
         return frame
-
-    def _look(self, elapsed_us: int, position: Vector, quaternion: Vector) -> NDArray[Any]:
-        at, attitude = camera_pose(position, quaternion, self._mount)
-        centers = self._arena.centers_at(elapsed_us)
-        return self._expose(self._arena, centers, self._intrinsics, self._max_range, at, attitude)
 
 
 class CameraServer:

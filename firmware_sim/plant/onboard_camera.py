@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Protocol
 
 from airl_mav.arena.geometry import Arena
@@ -41,6 +41,7 @@ class CameraMaker(Protocol):
         noise: SensorNoise | None,
         seed: int,
         renderer: Renderer,
+        further: Mapping[str, Camera] | None = None,
     ) -> OnboardCamera:
-        """Return the camera of a vehicle profile."""
+        """Return the camera of a vehicle profile, with those that are triggered with it."""
         ...

@@ -192,3 +192,16 @@ def test_it_gives_way_to_those_that_keep_time(process: CameraProcess) -> None:
     process.camera(CAMERA, arena(), 0, None, 3, "raycast")
     assert child().nice() > psutil.Process().nice()
     assert os.getsid(child().pid) == child().pid
+
+
+def test_a_frame_has_the_images_of_all_cameras(process: CameraProcess) -> None:
+    further = load_vehicle("quad-rig").cameras
+    camera = process.camera(CAMERA, arena(), 0, None, 3, "raycast", further)
+    frames = fly(camera, 0, lambda seen: len(seen) == 2)
+    drawn = SimulatedCamera(CAMERA, arena(), 0, None, 3, further=further)
+    for frame in frames:
+        at = frame.capture_time_us
+        expected = drawn.take(at, moving(at))
+        assert frame.further.keys() == {"down", "left", "right"}
+        for name, each in expected.further.items():
+            np.testing.assert_array_equal(frame.further[name].image, each.image)

@@ -15,6 +15,7 @@ from airl_mav.core.clock import SimClock
 from airl_mav.core.frames import geodetic_to_local
 from airl_mav.core.location import HOME
 from airl_mav.faults.model import Fault
+from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from airl_mav.scenario.aircraft import Aircraft
 from firmware_sim.autopilot.autopilot_state import Message
 from firmware_sim.autopilot.commander import Flight
@@ -308,7 +309,9 @@ def test_in_lockstep_commands_pass_and_take_along_what_was_sent_before() -> None
 # --- the camera
 
 
-def frames_of(*faults: str) -> list[tuple[int, Frame]]:
+def frames_of(
+    *faults: str, vehicle: VehicleProfile | None = None, **sensors: float
+) -> list[tuple[int, Frame]]:
     """Return the frames of two seconds in a small arena, each with the time at which it came."""
     from airl_mav.arena.generate import generate
     from airl_mav.profiles.arena import ArenaSpec
@@ -316,7 +319,8 @@ def frames_of(*faults: str) -> list[tuple[int, Frame]]:
 
     spec = load_profile("arenas", "static-obstacles", ArenaSpec)
     arena = generate(spec, 3, name="static-obstacles", vehicle_width_m=0.4, zone=None)
-    setup = EpisodeSetup(quad(), arena, 1, Aircraft.model_validate({"faults": faults}))
+    asked = Aircraft.model_validate({"faults": faults, "sensors": sensors})
+    setup = EpisodeSetup(vehicle or quad(), arena, 1, asked)
     simulation = Simulation(setup, start_us=0, clock=SimClock(), autopilot=Witness())
     frames: list[tuple[int, Frame]] = []
     for _ in range(500):
@@ -339,3 +343,23 @@ def test_a_camera_is_off_late_stuck_or_noisy() -> None:
         assert np.array_equal(was.depth_mm, now.depth_mm) is (time_us <= 1_000_000)
         assert held.capture_time_us == was.capture_time_us
     assert len({frame.depth_mm.tobytes() for time_us, frame in stuck if time_us > 500_000}) == 1
+
+
+def test_pictures_that_fail_are_the_main_camera_s() -> None:
+    rig: dict[str, Any] = {"vehicle": load_vehicle("quad-rig"), "depth_noise": 0.1}
+    healthy = frames_of(**rig)
+    noisy, stuck = (frames_of(f"camera {kind} at 500ms", **rig) for kind in ("noise 20%", "stuck"))
+    held, mains, sides = set(), set(), set()
+    for (time_us, was), (_, worse), (_, still) in zip(healthy, noisy, stuck, strict=True):
+        if time_us <= 500_000:
+            continue
+        assert not np.array_equal(was.depth_mm, worse.depth_mm)
+        for name, each in was.further.items():
+            assert np.array_equal(each.image, worse.further[name].image)
+            assert np.array_equal(each.image, still.further[name].image)
+        held.add(still.depth_mm.tobytes())
+        mains.add(was.depth_mm.tobytes())
+        sides.add(was.further["left"].image.tobytes())
+    assert len(held) == 1
+    assert len(mains) == len(sides) > 40
+    assert not [f for t, f in frames_of("camera off at 1s", **rig) if t > 1_000_000]

@@ -10,7 +10,7 @@ import pytest
 
 from airl_mav.camera.frame import Frame
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.render import Motion
+from airl_mav.camera.render import Motion, Mount
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.envs.arenas import batch_of
 from airl_mav.envs.colour_images import ColourImages, Looks
@@ -122,8 +122,7 @@ def test_the_companion_gets_the_images_that_the_twin_renders(
     camera, arena = asked.vehicle.camera, asked.arena_of(SEED)
     looks = Looks(1)
     looks.put(0, arena)
-    mount = SimulatedCamera(camera, arena)._mount
-    twin = ColourImages(Intrinsics.of(camera), mount, looks, MeshesSeen(1))
+    twin = ColourImages(Intrinsics.of(camera), Mount.of(camera), looks, MeshesSeen(1))
     fleet, arenas, image = new_fleet(1), batch_of([arena]), np.zeros((1, 48, 64, 3), np.uint8)
     spec = learned.card.observation
     for each, capture_us in zip(seen, captures.tolist(), strict=True):

@@ -13,6 +13,7 @@ from airl_mav.camera.render import Motion
 from airl_mav.core.errors import FieldError
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import spec_of
+from airl_mav.envs.trace import Trace
 from firmware_sim.plant.camera_server import SimulatedCamera
 
 QUIET = """
@@ -66,6 +67,22 @@ def test_the_plant_s_camera_takes_the_same_image(tmp_path: Path, shutter: str) -
         frame = camera.take(int(env.fleet.time_us[i]), motion_of(env, i))
         assert frame.image.tobytes() == images[i].tobytes()
     assert len(np.unique(images)) > 50
+
+
+@pytest.mark.parametrize("imaging", ["exposure_ms = 20.0", "readout_ms = 20.0"])
+def test_an_image_is_exposed_with_the_motion_of_its_moment(tmp_path: Path, imaging: str) -> None:
+    """Flown in one go, as in training, or step by step, as where it is recorded."""
+    path = tmp_path / "moving.toml"
+    path.write_text(f'base = "quad-rgb"\ndescription = "moving"\n[camera.imaging]\n{imaging}')
+    knobs = {"arena": "dynamic-obstacles", "vehicle": f"{path}"}
+    images = []
+    for trace in (None, Trace(2)):
+        env = Navigation(spec_of(None, knobs), 2, trace=trace)
+        env.begin([0, 1], [5, 8])
+        for _ in range(3):
+            env.fly(np.array([[4.0, 0.0, 0.9], [2.0, 1.0, -0.7]]))
+        images.append(env.cameras.image.copy())
+    np.testing.assert_array_equal(images[0], images[1])
 
 
 def test_noise_is_that_of_the_frame_s_number(tmp_path: Path) -> None:

@@ -21,9 +21,11 @@ from airl_mav.policy.action_sets import ActionSpec, command, commands
 from airl_mav.policy.layouts import encode_layout
 from airl_mav.policy.learned import LearnedPolicy, load_learned
 from airl_mav.policy.observation import Observation
-from airl_mav.policy.observation_spec import ObservationSpec
+from airl_mav.policy.observation_spec import ObservationSpec, SeenCamera
 from airl_mav.scenario.aircraft import Ports
+from airl_mav.training.config import NetworkSpec
 from airl_mav.training.export import export_sb3
+from airl_mav.training.networks import policy_arguments
 from airl_mav.training.recurrent import GreedyDecisions
 from tests.support.lockstep_kit import demo_scenario
 from tests.support.policy_kit import facts, make_model
@@ -189,3 +191,28 @@ def test_a_policy_with_a_memory_flies_in_a_companion_of_its_own(model: Any, tmp_
     # It decides anew with each image, and flies what it decides.
     assert np.ptp(setpoints[:, 0]) > 0.0
     assert np.isfinite(setpoints).all()
+
+
+def test_a_memory_of_what_several_cameras_saw(tmp_path: Path) -> None:
+    """The export decides as the learner, and each image counts."""
+    left = SeenCamera(height_px=24, width_px=32, horizontal_fov_deg=90.0, range_m=10.0)
+    shape = SHAPE.model_copy(update={"cameras": {"left": left}})
+    kwargs = {"lstm_hidden_size": 12, **policy_arguments(NetworkSpec())}
+    made = make_model("RecurrentPPO", "velocity", spec=shape, n_steps=8, policy_kwargs=kwargs)
+    actions = ActionSpec(set="velocity")
+    card = export_sb3(made, facts(name="two", actions=actions, observation=shape), tmp_path)
+    assert set(card.state) == {"hidden", "cell"}
+    spec = spec_of(None, {"vehicle": "quad-rig", "actions": "velocity", "cameras": {"left": {}}})
+    twin, decide = Navigation(spec, 2), GreedyDecisions(made)
+    exported = load_learned(tmp_path)
+    twin.begin([0, 1], [1, 2])
+    for slot in range(2):
+        decide.began(slot)
+    for _ in range(3):
+        seen = twin.observe()
+        assert seen.keys() == {"depth", "velocity", "goal", "depth_left"}
+        blind = {**seen, "depth_left": 255 - seen["depth_left"]}
+        assert not np.array_equal(fresh(exported).act_batch(seen), fresh(exported).act_batch(blind))
+        chosen = exported.act_batch(seen)
+        np.testing.assert_allclose(chosen, decide(seen), atol=1e-4)
+        twin.fly(commands(actions, chosen))

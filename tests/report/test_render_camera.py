@@ -24,6 +24,7 @@ from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.report.camera_taken import _rates
 from airl_mav.report.replay.runs import ReplayedRun
+from firmware_sim.plant.camera_server import SimulatedCamera
 from tests.support.run_demo import write_demo_run
 
 PROFILE = """
@@ -142,3 +143,32 @@ def test_ground_truth_of_a_flight_is_one_array(tmp_path: Path) -> None:
     render(str(folder.path), "0", *size, "--show", "flow", "--out", str(tmp_path / "flow.webp"))
     with pytest.raises(UsageError, match=r"accepted: depth, segmentation or flow in a file \.npy"):
         render(str(folder.path), "--out", str(tmp_path / "x.npy"))
+
+
+def test_a_further_camera_is_named(tmp_path: Path) -> None:
+    out = tmp_path / "down.png"
+    words = ("--camera", "quad-rig", "--camera-name", "down", "--height-m", "3")
+    render("varied-looks", "--seed", "4", *words, "--out", str(out))
+    arena = generate(
+        load_profile("arenas", "varied-looks", ArenaSpec), 4, name="x", vehicle_width_m=0.55
+    )
+    rig = load_vehicle("quad-rig")
+    cameras = SimulatedCamera(rig.camera, arena, further=rig.cameras)
+    level = np.array([1.0, 0.0, 0.0, 0.0])
+    wanted = cameras.capture(0, np.array([0.0, 0.0, -3.0]), level).further["down"].image
+    with Image.open(out) as image:
+        np.testing.assert_array_equal(np.asarray(image), wanted[..., 0])
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("--camera", "quad-rig", "--camera-name", "up"), "--camera-name up: .*down, left, right"),
+        (("--camera", "quad", "--camera-name", "up"), "none: vehicle quad has its main camera"),
+        (("--camera-name", "down"), "--camera-name down: without --camera"),
+        (("--camera-name", "down", "--show", "flow"), "--camera-name down: without --camera"),
+    ],
+)
+def test_a_camera_that_is_not_there_is_refused(words: tuple[str, ...], told: str) -> None:
+    with pytest.raises(UsageError, match=told):
+        render("no-obstacles", *words)

@@ -33,12 +33,17 @@ from airl_mav.black_box.messages import (
 from airl_mav.black_box.reading import read_black_box
 from airl_mav.black_box.schemas import foxglove_schema
 from airl_mav.black_box.writing import BlackBoxFile
+from airl_mav.camera.frame import Frame, FurtherImage
+from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.report.recorded_flight import episode_of
 from airl_mav.scenario.stand_alone import StandAloneCompanion
 from companion.black_box import BlackBoxRecorder
+from companion.camera import ReceivedFrame
+from companion.interfaces import BodyVelocity
+from companion.pilot import Decided
 from companion.program import prepare, run_of
 from tests.support.full_disk import largest_file
 from tests.support.processes import running, wait_until
@@ -278,3 +283,30 @@ def test_a_latency_that_was_asked_for_is_written_with_the_rest(tmp_path: Path) -
     file.finish()
     setup = read_black_box(file.path).run["setup"]
     assert setup["injection"]["latency"]["mean_ms"] == 150.0
+
+
+def test_images_of_further_cameras_have_topics_of_their_own(tmp_path: Path) -> None:
+    clock, path = SimClock(1_000_000), tmp_path / "flight.mcap"
+    recorder = BlackBoxRecorder(BlackBoxFile(path, RUN), Straight(clock), clock, (9.0, 0.0), 10.0)
+    depth = np.arange(6, dtype=np.uint16).reshape(2, 3)
+    grey = np.arange(8, dtype=np.uint8).reshape(2, 4, 1)
+    lenses = Intrinsics(3, 2, 1.5, 1.0, 0.5), Intrinsics(4, 2, 2.0, 1.5, 0.5, kind="grey")
+    down = FurtherImage(grey, lenses[1])
+    frame = Frame(1, 990_000, depth, lenses[0], further={"down": down})
+    now_us = clock.time_us()
+    seen, state = ReceivedFrame(frame, now_us), Straight(clock).kinematics()
+    times = (now_us, now_us, now_us, now_us, now_us)
+    recorder.decided(Decided(seen, state, BodyVelocity(1.0, 0.0, 0.0, 0.0), *times, None, depth))
+    recorder.end("goal reached", ())
+    with path.open("rb") as file:
+        read = make_reader(file, validate_crcs=True).iter_messages()
+        images = {channel.topic: json.loads(message.data) for _, channel, message in read}
+    assert images["/depth/down"]["frame_id"] == "down"
+    assert images["/depth/down"]["encoding"] == "mono8"
+    assert base64.b64decode(images["/depth/down"]["data"]) == bytes(range(8))
+    assert base64.b64decode(images["/depth"]["data"]) == depth.tobytes()
+    # Who reads it as a flight sees the main camera's images.
+    box = read_black_box(path)
+    assert box.whole
+    (image,) = box.all_of(RawImage)
+    np.testing.assert_array_equal(image_of(image), depth)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from airl_mav.camera.frame import LEAST_PX, MAX_MM, MOST_PX, Frame, FrameError, depth_to_z16
+from airl_mav.camera.frame import (
+    LEAST_PX,
+    MAX_MM,
+    MOST_PX,
+    Frame,
+    FrameError,
+    FurtherImage,
+    depth_to_z16,
+)
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.errors import UsageError
 from airl_mav.profiles.camera_kind import KINDS, CameraKind
@@ -162,3 +171,93 @@ def test_z16_is_within_half_a_millimetre(depth: np.ndarray) -> None:
     frame = Frame(0, 0, depth_to_z16(depth).reshape(4, 5), Intrinsics(5, 4, 1, 1, 1))
     assert frame.depth_m().dtype == np.float32
     np.testing.assert_allclose(frame.depth_m().ravel(), depth, atol=0.00051)
+
+
+# --- frames of several cameras
+
+
+@st.composite
+def rigs(draw: st.DrawFn) -> Frame:
+    main = draw(frames())
+    names = st.text("abcdefghijklmnopqrstuvwxyz_0123456789", min_size=1, max_size=24)
+    others = draw(st.dictionaries(names, frames(), min_size=1, max_size=4))
+    further = {name: FurtherImage(each.image, each.intrinsics) for name, each in others.items()}
+    return replace(main, further=further)
+
+
+@given(rigs())
+def test_a_rig_comes_back_with_all_images(frame: Frame) -> None:
+    back = Frame.from_bytes(frame.to_bytes())
+    assert (back.sequence, back.capture_time_us) == (frame.sequence, frame.capture_time_us)
+    assert back.intrinsics == frame.intrinsics
+    assert list(back.lenses.items()) == list(frame.lenses.items())
+    np.testing.assert_array_equal(back.image, frame.image)
+    for name, each in frame.further.items():
+        np.testing.assert_array_equal(back.further[name].image, each.image)
+
+
+@given(rigs(), st.data())
+def test_damaged_rigs_are_refused(frame: Frame, data: st.DataObject) -> None:
+    wire = frame.to_bytes()
+    cut = data.draw(st.integers(0, len(wire) - 1))
+    for damaged in (
+        wire[:cut],
+        wire + b"\0",
+        b"AMF2" + wire[4:],
+        wire[:4] + b"\xff\xff" + wire[6:],
+    ):
+        with pytest.raises(FrameError):
+            Frame.from_bytes(damaged)
+
+
+def rig() -> Frame:
+    lens = Intrinsics(3, 2, 1.5, 1.0, 0.5)
+    grey = Intrinsics(2, 1, 1.0, 0.5, 0.0, kind="grey")
+    depth = np.arange(6, dtype=np.uint16).reshape(2, 3)
+    down = FurtherImage(np.array([[[8], [9]]], np.uint8), grey)
+    return Frame(7, 123_456, depth, lens, further={"down": down})
+
+
+def test_a_rig_on_the_wire_is_whole_messages_one_behind_the_other() -> None:
+    """Another language can read it, and a message of one camera is as it was before."""
+    frame = rig()
+    main = replace(frame, further={}).to_bytes()
+    assert main[:4] == b"ADF1"
+    wire = frame.to_bytes()
+    assert wire[:6] == b"AMF1" + struct.pack("<H", 2)
+    assert wire[6:11] == struct.pack("<BI", 0, len(main))
+    assert wire[11 : 11 + len(main)] == main
+    rest = wire[11 + len(main) :]
+    assert rest[:9] == struct.pack("<BI", 4, 50) + b"down"
+    assert rest[9:13] == b"AGF1"
+    assert struct.unpack_from("<Qq", rest, 13) == (7, 123_456)
+    assert rest[57:] == bytes([8, 9])
+    with pytest.raises(FrameError, match="magic b'AMX1'"):
+        Frame.from_bytes(b"AMX1" + wire[4:])
+
+
+@pytest.mark.parametrize(
+    ("parts", "told"),
+    [
+        ([("down", 7, 5)], "camera 'down': accepted: first one without a name"),
+        ([("", 7, 5), ("", 7, 5)], "camera '': accepted"),
+        ([("", 7, 5), ("a", 7, 5), ("a", 7, 5)], "camera 'a': accepted"),
+        ([("", 7, 5), ("a", 8, 5)], "camera 'a': an image of another moment"),
+        ([("", 7, 5), ("a", 7, 6)], "camera 'a': an image of another moment"),
+    ],
+)
+def test_images_that_are_no_rig_s_are_refused(parts: list[tuple[str, int, int]], told: str) -> None:
+    wire = b"AMF1" + struct.pack("<H", len(parts))
+    for name, sequence, time_us in parts:
+        depth, lens = np.zeros((1, 1), np.uint16), Intrinsics(1, 1, 1.0, 0.0, 0.0)
+        message = Frame(sequence, time_us, depth, lens).to_bytes()
+        wire += struct.pack("<BI", len(name), len(message)) + name.encode() + message
+    with pytest.raises(FrameError, match=told):
+        Frame.from_bytes(wire)
+
+
+def test_a_rig_within_a_rig_is_refused() -> None:
+    inner = rig().to_bytes()
+    wire = b"AMF1" + struct.pack("<H", 1) + struct.pack("<BI", 0, len(inner)) + inner
+    with pytest.raises(FrameError, match="several cameras within one"):
+        Frame.from_bytes(wire)

@@ -253,6 +253,15 @@ def test_small_rotation_vectors(size: float) -> None:
     np.testing.assert_allclose(q, [1.0, 0.0, size / 2, 0.0], rtol=1e-12, atol=1e-13)
 
 
+@given(st.floats(-1.5, 1.5), st.floats(-3.1, 3.1), vectors)
+def test_a_camera_looks_where_it_is_mounted_to(pitch_up: float, yaw: float, v: np.ndarray) -> None:
+    # To the right of the nose is a negative turn about the axis up.
+    q = frames.quat_flu_from_optical(pitch_up, yaw)
+    expected = to_scipy(frames.quat_flu_from_optical(pitch_up)).apply(v)
+    expected = Rotation.from_euler("Z", -yaw).apply(expected)
+    np.testing.assert_allclose(to_scipy(q).apply(v), expected, atol=1e-9)
+
+
 @given(st.floats(-1.5, 1.5), vectors)
 def test_a_camera_looks_ahead_and_up_as_it_is_mounted(pitch_up: float, v: np.ndarray) -> None:
     q = frames.quat_flu_from_optical(pitch_up)

@@ -387,14 +387,16 @@ def test_a_vehicle_of_unknown_response_is_refused_in_one_line() -> None:
     assert caught.value.field == "compensate"
 
 
-def test_the_camera_sits_where_the_renderer_has_it() -> None:
-    """Before the centre, above it and tilted: the same pose as the renderer's."""
-    camera = QUAD.camera.model_copy(update={"pitch_up_deg": 12.0, "up_m": 0.2})
+@pytest.mark.parametrize("aside", [{}, {"yaw_deg": -70.0, "right_m": -0.3}])
+def test_the_camera_sits_where_the_renderer_has_it(aside: dict[str, float]) -> None:
+    """Before the centre, above it, tilted and turned: the same pose as the renderer's."""
+    camera = QUAD.camera.model_copy(update={"pitch_up_deg": 12.0, "up_m": 0.2, **aside})
     vehicle = QUAD.model_copy(update={"camera": camera})
     arena = arena_of("static-obstacles", 4)
     quaternion = quat_from_euler(0.05, -0.15, 0.9)
     position = np.array([2.0, 1.0, -2.5])
-    mount = Mount((camera.forward_m, 0.0, -camera.up_m), math.radians(camera.pitch_up_deg))
+    angles = map(math.radians, (camera.pitch_up_deg, camera.yaw_deg))
+    mount = Mount((camera.forward_m, camera.right_m, -camera.up_m), *angles)
     view = partial(render, arena, arena.centers_at(0), LENS, RANGE_M)
     seen = depth_to_z16(view(*camera_pose(position, quaternion, mount)))
     compensator = Compensator(1, vehicle, LENS)

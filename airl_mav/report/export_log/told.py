@@ -180,7 +180,7 @@ class FlightMessages:
                         parent_frame_id=VEHICLE,
                         child_frame_id=CAMERA,
                         translation=vector(frd_to_flu(np.array(mount.offset))),
-                        rotation=quaternion(quat_flu_from_optical(mount.pitch_up)),
+                        rotation=quaternion(quat_flu_from_optical(mount.pitch_up, mount.yaw)),
                     )
                 )
             yield self._drawn(time_us, topic, FrameTransforms(transforms=transforms))

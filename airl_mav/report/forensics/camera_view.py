@@ -42,6 +42,10 @@ class PolicyCamera:
         """Return how far to either side it sees [rad]."""
         return 0.5 * self.intrinsics.horizontal_fov_rad
 
+    def aside_rad(self, bearing_rad: float) -> float:
+        """Return how far beside the optical axis a bearing from the heading lies [rad]."""
+        return abs(math.remainder(bearing_rad - self.mount.yaw, math.tau))
+
 
 @dataclass(frozen=True)
 class ObstacleView:

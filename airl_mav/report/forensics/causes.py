@@ -69,7 +69,8 @@ def _cause_of_collision(flight: Evidence, crash: Collision) -> Cause:
     if (view := crash.view) is not None:
         sentences.insert(0, _where(crash, flight.camera))
         half_angle = flight.camera.half_angle_rad if flight.camera else math.pi
-        shown = crash.seen[-1] if crash.seen else abs(view.bearing_rad) <= half_angle
+        aside = flight.camera.aside_rad if flight.camera else abs
+        shown = crash.seen[-1] if crash.seen else aside(view.bearing_rad) <= half_angle
         if not shown:
             kind = "hidden behind something nearer" if view.hidden else "hit out of the picture"
         else:
@@ -78,7 +79,7 @@ def _cause_of_collision(flight: Evidence, crash: Collision) -> Cause:
             sentences.append(
                 f"It was in {sum(crash.seen)} of the last {len(crash.seen)} frames used."
             )
-        if abs(crash.off_heading_rad) > half_angle:
+        if aside(crash.off_heading_rad) > half_angle:
             sentences.append(
                 f"It was flying {_side(crash.off_heading_rad)} of its heading, where the camera "
                 "does not look."
@@ -115,7 +116,7 @@ def _where(crash: Collision, camera: PolicyCamera | None) -> str:
     limit = math.degrees(camera.half_angle_rad)
     if view.hidden:
         return f"On the last frame used, {crash.what} was hidden by something nearer: {place}."
-    if abs(view.bearing_rad) > camera.half_angle_rad:
+    if camera.aside_rad(view.bearing_rad) > camera.half_angle_rad:
         return (
             f"On the last frame used, {crash.what} lay {place}; the camera sees {limit:.0f}° to "
             "either side."
