@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from airl_mav.arena.appearance import FLOOR as FLOOR_ROW
 from airl_mav.arena.appearance import OBSTACLE as OBSTACLE_ROW
 from airl_mav.arena.appearance import WALLS as WALLS_ROW
-from airl_mav.camera.bvh import Meshes, is_owned
+from airl_mav.camera.bvh import Meshes, is_owned, raised
 from airl_mav.camera.mesh_shadows import shade_by_meshes
 from airl_mav.camera.mesh_surfaces import shade_meshes
-from airl_mav.camera.primitives import OBSTACLE, SKY, Ids
+from airl_mav.camera.primitives import FLOOR, GROUND, OBSTACLE, SKY, Ids
 from airl_mav.camera.projection import MIN_DEPTH_M, Bent, Pose
 from airl_mav.camera.raycast import aim, blank, draw_bodies, invert
 from airl_mav.camera.shading import F32, ZERO, Lit, Packed, Plane, Points, Rays, surface_of
@@ -108,7 +108,8 @@ def render_colour(
         depth: (height, width) depth [m] as `render_depth` defines it, without a limit of range,
             written; 0: no surface.
         seen: (height, width) what each pixel sees, written: CEILING, SKY, ... of `primitives`, for
-            an obstacle OBSTACLE + its number, for a mesh that of the first obstacle it owns.
+            an obstacle OBSTACLE + its number, for a mesh that of the first obstacle it owns, for
+            hills FLOOR.
         work: For this size of image.
         position: As of `render_depth`, with the rest up to `meshes`.
         quaternion: (4,).
@@ -131,11 +132,12 @@ def render_colour(
         atlas: `textures.atlas()`.
         bent: As of `render_depth`.
     """
-    camera = (position[0], position[1], min(position[2], -MIN_DEPTH_M))
+    camera = raised(meshes, position)
     lines, xs = work.lines, work.xs
     view, axes = aim(lines, xs, quaternion, focal, cx, cy, cylindrical, RANGE_M)
     far, ids = (work.far, work.ids) if cylindrical else (depth, seen)
-    rectangles = np.zeros((len(shape), 3, 4), np.int32)
+    n_meshes = 0 if meshes is None else len(meshes.first)
+    rectangles = np.zeros((len(shape) + n_meshes, 3, 4), np.int32)
     faces = None if meshes is None else np.empty(far.shape, np.int32)
     inside = draw_bodies(
         far, ids, rectangles, lines, xs, bent, view, axes, camera, bounds, shape, center, half_size,
@@ -201,6 +203,9 @@ def render_colour(
     if bent is not None:
         _blacken(out, bent)
     _unpack(rgb, out, cylindrical)
+    if meshes is not None and len(meshes.relief.heights) > 0:
+        for at in range(len(all_ids)):
+            all_ids[at] = FLOOR if all_ids[at] == GROUND else all_ids[at]
     if cylindrical:
         depth[:, :] = far.T
         seen[:, :] = ids.T

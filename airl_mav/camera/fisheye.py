@@ -25,9 +25,10 @@ def _bent_of(camera: Intrinsics) -> Bent:
 
 
 def check_meshes(camera: Intrinsics, arena: Arena) -> None:
-    """Raise UsageError where a fisheye looks at an arena with meshes."""
-    if camera.projection == "fisheye" and arena.meshes:
+    """Raise UsageError where a fisheye looks at an arena with meshes, or hills."""
+    if camera.projection == "fisheye" and (arena.meshes or arena.ground is not None):
+        what = "meshes" if arena.meshes else "hills"
         raise UsageError(
-            f"arena {arena.name}: a fisheye sees no meshes; accepted: a pinhole or a cylinder, or"
-            " an arena without meshes"
+            f"arena {arena.name}: a fisheye sees no {what}; accepted: a pinhole or a cylinder, or"
+            f" an arena without {what}"
         )
