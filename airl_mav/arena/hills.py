@@ -39,7 +39,8 @@ def draw_ground(rng: np.random.Generator, terrain: Terrain, bounds: Bounds) -> G
     pitch = terrain.pitch_m(length, width)
     rows, columns = max(2, math.floor(length / pitch)), max(2, math.floor(width / pitch))
     step_n, step_e = length / rows, width / columns
-    north, east = step_n * np.arange(rows + 1), step_e * np.arange(columns + 1)
+    north: Floats = step_n * np.arange(rows + 1, dtype=np.float64)
+    east: Floats = step_e * np.arange(columns + 1, dtype=np.float64)
     away = np.sqrt(
         (bounds.north_min + north[:, None]) ** 2 + (bounds.east_min + east[None, :]) ** 2
     )
