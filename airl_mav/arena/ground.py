@@ -103,6 +103,22 @@ class Ground:
         """Return how high the ground is above the floor at a place [m]; 0 beyond the walls."""
         return float(plane_at(self.relief, north, east)[0])
 
+    def heights_at(self, places: Floats) -> Floats:
+        """Return the heights (n,) [m] below points (n, >= 2) NED [m]."""
+        return np.array([self.height_at(float(each[0]), float(each[1])) for each in places])
+
+    def coarser(self, most: int) -> Ground:
+        """Return ground of so many cells at most, for pictures: its own where it has no more."""
+        rows, columns = (count - 1 for count in self.heights.shape)
+        if rows * columns <= most:
+            return self
+        share = math.sqrt(most / (rows * columns))
+        fewer_n, fewer_e = max(1, math.floor(share * rows)), max(1, math.floor(share * columns))
+        step_n, step_e = self.step_north * rows / fewer_n, self.step_east * columns / fewer_e
+        north = self.south + step_n * np.arange(fewer_n + 1, dtype=np.float64)
+        east = self.west + step_e * np.arange(fewer_e + 1, dtype=np.float64)
+        return Ground(self.sampled(north, east), self.south, self.west, step_n, step_e)
+
     def lowest_within(self, north: float, east: float, radius: float) -> float:
         """Return the least height of the ground within a radius [m] of a place on the floor."""
         return -float(extreme_within(self.relief, north, east, radius, -1.0))

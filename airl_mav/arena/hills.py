@@ -9,7 +9,6 @@ of the numbers drawn: a seed gives the same bits on any machine.
 from __future__ import annotations
 
 import math
-
 from dataclasses import replace
 
 import numpy as np

@@ -35,7 +35,7 @@ class ArenaBatch(NamedTuple):
 
 
 def empty_batch(n: int, obstacles: int, movers: int, points: int, heights: int = 0) -> ArenaBatch:
-    """Return room for n arenas of at most so many obstacles, movers, way-points and heights each."""
+    """Return room for n arenas of at most so many obstacles, movers, way-points and heights."""
     return ArenaBatch(
         bounds=np.zeros((n, 6)),
         n_obstacles=np.zeros(n, np.int64),

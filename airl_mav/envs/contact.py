@@ -92,10 +92,9 @@ def touches(
     x, y, z = position
     if z + half_height > 0.0:
         return FLOOR
-    if relief is not None and len(relief.heights) > 0:
-        # Beyond the walls it is minus infinity: there the floor is level.
-        if z + half_height > -extreme_within(relief, x, y, radius, 1.0):
-            return FLOOR
+    # Beyond the walls, and without hills, it is minus infinity: there the floor is level.
+    if relief is not None and z + half_height > -extreme_within(relief, x, y, radius, 1.0):
+        return FLOOR
     if bounds[5] > 0.0 and z - half_height < -bounds[4]:
         return CEILING
     if z + half_height > -bounds[4] and (

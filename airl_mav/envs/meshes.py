@@ -1,4 +1,4 @@
-"""The meshes of n arenas as arrays, and their hills: what the cameras of the batch twin see of them.
+"""The meshes of n arenas as arrays, hills among them: what the cameras of the batch twin see.
 
 The trees of files are there once, whichever arenas they stand in. Each arena has ground of its own:
 behind the trees of files there is room for that of every arena.

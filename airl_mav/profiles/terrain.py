@@ -27,8 +27,8 @@ class Terrain(ProfileModel):
     """Hills on the floor. The ground is nowhere below it."""
 
     relief_m: Annotated[tuple[float, float], Each(0, 50, ascending=True)] = quantity(
-        "height of the highest hill above the floor, drawn from [least, greatest]; [0, 0]: the floor"
-        " is flat",
+        "height of the highest hill above the floor, drawn from [least, greatest]; [0, 0]: there"
+        " are none",
         "m",
         default=(0.0, 0.0),
     )

@@ -87,10 +87,10 @@ def _touch_points(
     x, y = p[0] - grid[0], p[1] - grid[1]
     back = conjugate(q)
     down = rotate(back, (0.0, 0.0, 1.0))
-    first_row = max(int(math.ceil((x - radius) / grid[2])), 0)
-    last_row = min(int(math.floor((x + radius) / grid[2])), n_rows - 1)
-    first_column = max(int(math.ceil((y - radius) / grid[3])), 0)
-    last_column = min(int(math.floor((y + radius) / grid[3])), n_columns - 1)
+    first_row = max(math.ceil((x - radius) / grid[2]), 0)
+    last_row = min(math.floor((x + radius) / grid[2]), n_rows - 1)
+    first_column = max(math.ceil((y - radius) / grid[3]), 0)
+    last_column = min(math.floor((y + radius) / grid[3]), n_columns - 1)
     for i in range(first_row, last_row + 1):
         for j in range(first_column, last_column + 1):
             height = heights[i * n_columns + j]
@@ -154,7 +154,7 @@ def _touch_ridges(
         at, step, beside, along = y, dy, (0.0, grid[3]), (grid[2], 0.0)
     if abs(step) < 1e-12:
         return count
-    for line in range(int(math.ceil(min(at, at + step))), int(math.floor(max(at, at + step))) + 1):
+    for line in range(math.ceil(min(at, at + step)), math.floor(max(at, at + step)) + 1):
         share = (line - at) / step
         arm = (a[0] + share * d[0], a[1] + share * d[1], a[2] + share * d[2])
         n, e = p[0] + arm[0], p[1] + arm[1]
