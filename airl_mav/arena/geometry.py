@@ -1,8 +1,8 @@
 """A concrete arena as plain arrays: what the plant, the camera, training and the report share.
 
 Frame: local NED, origin at the vehicle's start on the floor, x north. The floor is z = 0; heights
-are negative z. The four walls stand on the edges of `bounds`. Hills rise above the floor where there
-is a `ground`.
+are negative z. The four walls stand on the edges of `bounds`. Hills rise above the floor where
+there is a `ground`.
 """
 
 from __future__ import annotations

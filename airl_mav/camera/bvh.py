@@ -293,6 +293,12 @@ class Meshes(NamedTuple):
 
 
 @kernel
+def count_of(meshes: Meshes | None) -> int:
+    """Return how many meshes there are."""
+    return 0 if meshes is None else len(meshes.first)
+
+
+@kernel
 def material_row(meshes: Meshes, k: int) -> int:
     """Return the row of mesh k's material in `Finish`."""
     first = meshes.first[k]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from airl_mav.arena.appearance import FLOOR as FLOOR_ROW
 from airl_mav.arena.appearance import OBSTACLE as OBSTACLE_ROW
 from airl_mav.arena.appearance import WALLS as WALLS_ROW
-from airl_mav.camera.bvh import Meshes, is_owned, raised
+from airl_mav.camera.bvh import Meshes, count_of, is_owned, raised
 from airl_mav.camera.mesh_shadows import shade_by_meshes
 from airl_mav.camera.mesh_surfaces import shade_meshes
 from airl_mav.camera.primitives import FLOOR, GROUND, OBSTACLE, SKY, Ids
@@ -136,8 +136,7 @@ def render_colour(
     lines, xs = work.lines, work.xs
     view, axes = aim(lines, xs, quaternion, focal, cx, cy, cylindrical, RANGE_M)
     far, ids = (work.far, work.ids) if cylindrical else (depth, seen)
-    n_meshes = 0 if meshes is None else len(meshes.first)
-    rectangles = np.zeros((len(shape) + n_meshes, 3, 4), np.int32)
+    rectangles = np.zeros((len(shape) + count_of(meshes), 3, 4), np.int32)
     faces = None if meshes is None else np.empty(far.shape, np.int32)
     inside = draw_bodies(
         far, ids, rectangles, lines, xs, bent, view, axes, camera, bounds, shape, center, half_size,
@@ -203,12 +202,19 @@ def render_colour(
     if bent is not None:
         _blacken(out, bent)
     _unpack(rgb, out, cylindrical)
-    if meshes is not None and len(meshes.relief.heights) > 0:
-        for at in range(len(all_ids)):
-            all_ids[at] = FLOOR if all_ids[at] == GROUND else all_ids[at]
+    _tell_ground(all_ids, meshes)
     if cylindrical:
         depth[:, :] = far.T
         seen[:, :] = ids.T
+
+
+@kernel
+def _tell_ground(ids: Ids, meshes: Meshes | None) -> None:
+    """Write the floor's number (n,) where hills are seen."""
+    if meshes is None:
+        return
+    for at in range(len(ids)):
+        ids[at] = FLOOR if ids[at] == GROUND else ids[at]
 
 
 @kernel

@@ -205,8 +205,8 @@ def draw_bodies(
 
     Args:
         out: (n, m) inverse depth [1/m], written.
-        ids: (n, m) written: what each pixel sees, CEILING, SKY, ... or OBSTACLE + its number, GROUND
-            of hills; None: nobody asks, and nothing is spent on it.
+        ids: (n, m) written: what each pixel sees, CEILING, SKY, ... or OBSTACLE + its number, or
+            GROUND where that is hills; None: nobody asks, and nothing is spent on it.
         drawn_in: (obstacles + meshes, 3, 4) written: the rectangles that each obstacle, and each
             mesh, was drawn in; None: nobody asks.
         lines: Of `aim`, with the next three.

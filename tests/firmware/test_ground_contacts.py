@@ -196,9 +196,10 @@ def test_both_plants_land_on_a_gentle_slope_and_stay_there() -> None:
 def test_neither_plant_flies_through_a_hill() -> None:
     arena = hills()
     ground = ground_of(arena)
-    top = np.unravel_index(ground.heights.argmax(), ground.heights.shape)
-    north = ground.south + ground.step_north * top[0]
-    east = ground.west + ground.step_east * top[1]
+    inner = ground.heights[8:-8, 8:-8]
+    top = np.unravel_index(inner.argmax(), inner.shape)
+    north = ground.south + ground.step_north * (8 + top[0])
+    east = ground.west + ground.step_east * (8 + top[1])
     with both(arena) as plants:
         for plant in plants:
             hits = list[tuple[float, float]]()
@@ -209,7 +210,7 @@ def test_neither_plant_flies_through_a_hill() -> None:
                 if not (inside and b.east_min + 1 < at[1] < b.east_max - 1):
                     continue
                 plant.put(
-                    (*at, -0.6 * ground.top_m), (8.0 * math.cos(way), 8.0 * math.sin(way), -1.0)
+                    (*at, -0.6 * inner.max()), (8.0 * math.cos(way), 8.0 * math.sin(way), -1.0)
                 )
                 for _ in range(300):
                     plant.step(OFF)
