@@ -170,6 +170,20 @@ def test_meshes_are_theirs(material: str, tmp_path: Path) -> None:
     assert float(np.abs(ours.astype(float) - theirs)[shown].mean()) / 255.0 > 0.1
 
 
+@pytest.mark.parametrize("material", ["earth", "grass"])
+def test_hills_are_theirs(material: str) -> None:
+    """Triangles above the floor in its material, whose pattern goes on over them."""
+    scene = arena("hills", 3, **{**LIGHT, **PLAIN, "floor": {"materials": [material]}})
+    inner, _ = difference(scene, (-2.0, 0.0, -4.0), 0.2, rays=4)
+    assert inner < 0.03
+    # A flat floor is far off: the limit above can fail.
+    place, attitude = np.array([-2.0, 0.0, -4.0]), quat_from_euler(0.03, -0.08, 0.2)
+    centers, flat = scene.obstacles.center, replace(scene, ground=None)
+    theirs = path_traced(scene, centers, CAMERA, place, attitude, samples=16)
+    ours = antialiased(flat, centers, CAMERA, place, attitude, 4)
+    assert float(np.abs(ours.astype(float) - theirs).mean()) / 255.0 > 0.02
+
+
 def test_what_it_has_not_is_refused() -> None:
     fog = arena("no-obstacles", 0, fog={"extinction_1_m": [0.1, 0.1]})
     place, level = np.array([0.0, 0.0, -2.5]), quat_from_euler(0, 0, 0)
