@@ -16,7 +16,7 @@ import scipy
 from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Shape
-from airl_mav.arena.ground import TOP, plane_at
+from airl_mav.arena.ground import TOP, extreme_within
 from airl_mav.core.kernels import kernel
 from airl_mav.envs.arenas import ArenaBatch, relief_of
 
@@ -116,7 +116,8 @@ def _to_hills(
 ) -> NDArray[np.float64]:
     """Return the distances (rows, columns) [m] to ground that is higher; negative in it.
 
-    To half a cell, by the exact Euclidean distances between the centres of cells of both kinds.
+    No more than a quarter of a cell too far, and little more than a cell too near: by the exact
+    Euclidean distances between the centres of cells of both kinds.
     """
     high = np.empty(shape, np.bool_)
     _fill_high(batch, i, most_m, first, cell, high)
@@ -137,12 +138,12 @@ def _fill_high(
     cell: float,
     high: NDArray[np.bool_],
 ) -> None:
-    """Write which cells (rows, columns) are on ground that is higher than that [m]."""
-    relief = relief_of(batch, i)
+    """Write in which cells (rows, columns), to their corners, any ground is higher than that [m]."""
+    relief, corner = relief_of(batch, i), cell / math.sqrt(2.0)
     for row in range(high.shape[0]):
         for column in range(high.shape[1]):
             north, east = first[0] + row * cell, first[1] + column * cell
-            high[row, column] = plane_at(relief, north, east)[0] > most_m
+            high[row, column] = extreme_within(relief, north, east, corner, 1.0) > most_m
 
 
 @kernel
