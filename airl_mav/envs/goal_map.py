@@ -138,7 +138,7 @@ def _fill_high(
     cell: float,
     high: NDArray[np.bool_],
 ) -> None:
-    """Write in which cells (rows, columns), to their corners, any ground is higher than that [m]."""
+    """Write in which cells (rows, columns), out to their corners, any ground is higher [m]."""
     relief, corner = relief_of(batch, i), cell / math.sqrt(2.0)
     for row in range(high.shape[0]):
         for column in range(high.shape[1]):

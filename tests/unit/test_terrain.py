@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,11 +14,12 @@ import scipy
 from matplotlib.tri import LinearTriInterpolator, Triangulation
 from numpy.typing import NDArray
 
-from airl_mav.arena.footprints import bounding_half
+from airl_mav.arena.footprints import Boxes, bounding_half
 from airl_mav.arena.generate import generate, local_bounds
 from airl_mav.arena.geometry import Arena, Obstacles, Shape
 from airl_mav.arena.ground import Ground, extreme_within, no_relief, plane_at
-from airl_mav.arena.hills import draw_ground
+from airl_mav.arena.hills import draw_ground, stand_on
+from airl_mav.arena.own import _problem
 from airl_mav.arena.passage import Hills, raster_passage
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.picture import render_picture
@@ -31,7 +33,8 @@ from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.projection import Projection
 from airl_mav.profiles.terrain import MOST_CELLS, Terrain
-from tests.unit.test_meshes_seen import nearest, rays_of
+from tests.support.meshes import kept, ring, scene_of, triangles
+from tests.unit.test_meshes_seen import in_world, nearest, rays_of
 
 Floats = NDArray[np.float64]
 
@@ -320,6 +323,39 @@ def test_a_camera_below_the_ground_is_raised_above_it() -> None:
         np.testing.assert_allclose(image, 0.001, rtol=0.2)
 
 
+def test_meshes_on_hills_stand_as_high_as_their_place(tmp_path: Path) -> None:
+    file = kept(triangles(ring()), tmp_path / "ring.npz")
+    arena, rng, pixels = bare(arena_of(3)), np.random.default_rng(6), 0
+    ground = ground_of(arena)
+    places = [(8.0, -3.0, 0.4, 1.5), (16.0, 6.0, -1.0, 2.0), (20.0, -18.0, 2.0, 1.0)]
+    scene = scene_of(file, places)
+    boxes = Boxes(np.array(places)[:, :2], np.full((3, 2), 0.5))
+    standing, meshes = stand_on(ground, scene.obstacles, boxes, None, scene.meshes)
+    lifts = [ground.lowest_within(north, east, math.hypot(0.5, 0.5)) for north, east, *_ in places]
+    assert [mesh.base_m for mesh in meshes] == lifts
+    assert max(lifts) > 0.3
+    np.testing.assert_allclose(-standing.center[:, 2], np.array(lifts) + 0.5)
+    arena = replace(arena, obstacles=standing, meshes=meshes)
+    corners = np.concatenate([ground.points[ground.faces], in_world(scene)])
+    for number, lift in enumerate(lifts):
+        corners[len(ground.faces) + 768 * number :][:768, :, 2] -= lift
+    flat = bare(replace(arena, ground=None))
+    for _ in range(4):
+        k = Intrinsics.from_fov(25, 19, 1.4)
+        at = np.array([*rng.uniform([2.0, -8.0], [9.0, 2.0]), -rng.uniform(2.0, 4.0)])
+        attitude = quat_from_euler(0.0, -0.1, rng.uniform(-0.6, 0.6))
+        seen = render(arena, arena.obstacles.center, k, math.inf, at, attitude).astype(np.float64)
+        room = render(flat, flat.obstacles.center, k, math.inf, at, attitude).astype(np.float64)
+        rays = rays_of(k, attitude)
+        hits = nearest(np.broadcast_to(at, rays.shape), rays, corners).reshape(seen.shape)
+        both = np.minimum(np.where(room > 0.0, room, math.inf), hits)
+        expected = np.where(np.isfinite(both), both, 0.0)
+        assert (np.abs(seen - expected) <= 1e-4 + 1e-4 * expected).mean() > 0.998
+        alone = nearest(np.broadcast_to(at, rays.shape), rays, corners[len(ground.faces) :])
+        pixels += int((np.abs(alone.reshape(seen.shape) - seen) < 1e-3).sum())
+    assert pixels > 20
+
+
 def test_hills_are_ground_and_look_like_the_floor() -> None:
     arena = arena_of(3)
     k = Intrinsics.from_fov(120, 90, 1.4, kind="rgb")
@@ -473,6 +509,23 @@ def test_a_large_arena_has_hills_of_a_bounded_number_of_cells() -> None:
     rows, columns = ground.heights.shape
     assert (rows - 1) * (columns - 1) <= MOST_CELLS
     assert ground.top_m == pytest.approx(20.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"heights": np.zeros((1, 5))}, "ground.heights (1, 5); accepted: two or more each way"),
+        ({"heights": np.full((3, 3), -0.1)}, "none below 0"),
+        ({"heights": np.full((3, 3), math.inf)}, "accepted: finite heights"),
+        ({"step_east": 0.0}, "steps > 0"),
+    ],
+)
+def test_ground_of_a_generator_of_one_s_own_is_looked_at(change: dict[str, Any], told: str) -> None:
+    arena = arena_of(3)
+    assert _problem(arena) is None
+    problem = _problem(replace(arena, ground=replace(ground_of(arena), **change)))
+    assert problem is not None
+    assert told in problem
 
 
 def test_a_fisheye_sees_no_hills() -> None:
