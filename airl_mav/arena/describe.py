@@ -12,6 +12,7 @@ from airl_mav.arena.footprints import Floats
 from airl_mav.arena.gates import openings_of
 from airl_mav.arena.generate import free_area_fraction
 from airl_mav.arena.geometry import Arena, Shape, Tour
+from airl_mav.arena.ground import STEEPEST
 from airl_mav.arena.zones import zone_of
 from airl_mav.profiles.arena import ArenaSpec
 
@@ -28,6 +29,14 @@ def arena_table(arena: Arena, spec: ArenaSpec) -> Table:
         table.add_row("ceiling", f"{b.height:g} m high")
     if (building := arena.building) is not None:
         table.add_row("rooms", f"{building.rooms}, {building.doors} doors")
+    if (ground := arena.ground) is not None:
+        table.add_row("hills", f"up to {ground.top_m:.2f} m high")
+        steepest = math.degrees(math.atan(float(ground.relief.grid[STEEPEST])))
+        table.add_row("  steepest", f"{steepest:.0f} deg")
+        points = f"{' x '.join(str(n) for n in ground.heights.shape)}"
+        table.add_row("  grid", f"{points} points, {ground.step_north:.2f} m apart")
+        at = ground.height_at(float(arena.goal[0]), float(arena.goal[1]))
+        table.add_row("  at the goal", f"{at:.2f} m")
     table.add_row("start from the south-west corner", f"{-b.north_min:g} N {-b.east_min:g} E m")
     table.add_row("static obstacles", _shapes(arena, moving=False))
     table.add_row("moving obstacles", _shapes(arena, moving=True))
@@ -45,7 +54,7 @@ def arena_table(arena: Arena, spec: ArenaSpec) -> Table:
     where = "beyond the zones" if zone is None else f"zone {zone}"
     table.add_row("goal from the start", f"{north:.2f} N {east:.2f} E m")
     if arena.goal_height_m is not None:
-        table.add_row("  height", f"{arena.goal_height_m:.2f} m")
+        table.add_row("  height above the start", f"{arena.goal_height_m:.2f} m")
     table.add_row("  distance", f"{math.hypot(north, east):.2f} m, {where}")
     table.add_row("floor free of static obstacles", f"{free_area_fraction(arena):.1%}")
     return table

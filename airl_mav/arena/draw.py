@@ -1,7 +1,8 @@
 """An arena from above on a matplotlib Axes: x east, y north, metres from the start.
 
-Layers (zorder): floor and grid below 1, zones and tours 1, obstacles 2, start and goal 3. Draw what
-flew through it at 2.5 or above. Every kind of thing has one labelled artist, for the legend.
+Layers (zorder): floor, hills and grid below 1, zones and tours 1, obstacles 2, start and goal 3.
+Draw what flew through it at 2.5 or above. Every kind of thing has one labelled artist, for the
+legend.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import to_rgba
+from matplotlib.colors import LinearSegmentedColormap, to_rgba
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Patch, Polygon, Rectangle
 from matplotlib.ticker import MultipleLocator
@@ -23,6 +24,7 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.gates import over_openings
 from airl_mav.arena.geometry import Arena, Shape, Tour
+from airl_mav.arena.ground import Ground
 from airl_mav.arena.rooms import over_doors
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.files import replace_file
@@ -35,6 +37,8 @@ STATIC_COLOURS = ("#5b6670", "#2f363d")
 MOVING_COLOURS = ("#f0932b", "#9c5a0c")
 OPENING, OPENING_COLOUR = "opening", "#cfe3f5"
 """What is below and above the opening of a gate, or a door: from above, the way leads through."""
+LOW_COLOUR, HIGH_COLOUR, CONTOUR_COLOUR = "#f2efe6", "#b39b6d", "#a08a5e"
+"""Of ground that hardly rises, of the highest, and of the lines of equal height."""
 START_COLOUR = "#1f4e8c"
 GOAL_COLOUR = "#1b8a3f"
 ZONE_COLOUR = "#8d8a83"
@@ -130,6 +134,8 @@ def _draw_floor(arena: Arena, ax: Axes) -> None:
     outer = (b.east_min - thick, b.north_min - thick), width + 2.0 * thick, length + 2.0 * thick
     ax.add_patch(Rectangle(*outer, facecolor=colour, zorder=0.1))
     ax.add_patch(Rectangle(*_floor(arena), facecolor=FLOOR_COLOUR, zorder=0.2))
+    if arena.ground is not None:
+        _draw_ground(arena.ground, ax)
     step = _round_step(max(length, width) / 6.0)
     for axis in (ax.xaxis, ax.yaxis):
         axis.set_major_locator(MultipleLocator(step))
@@ -145,6 +151,23 @@ def _draw_floor(arena: Arena, ax: Axes) -> None:
     ax.tick_params(colors=TEXT_COLOUR, length=0, labelsize=8.5)
     for spine in ax.spines.values():
         spine.set_visible(False)
+
+
+def _draw_ground(ground: Ground, ax: Axes) -> None:
+    """Draw hills in tones between lines of equal height."""
+    rows, columns = ground.heights.shape
+    north = ground.south + ground.step_north * np.arange(rows)
+    east = ground.west + ground.step_east * np.arange(columns)
+    step = _round_step(ground.top_m / 8.0)
+    levels = np.arange(0.0, ground.top_m + step, step)
+    tones = LinearSegmentedColormap.from_list("ground", [LOW_COLOUR, HIGH_COLOUR])
+    # The lowest tone begins where the ground does rise: the rest is the floor.
+    filled = [1e-3, *levels[1:]]
+    ax.contourf(east, north, ground.heights, filled, cmap=tones, zorder=0.25)
+    lines: dict[str, Any] = {"colors": CONTOUR_COLOUR, "linewidths": 0.6, "zorder": 0.35}
+    ax.contour(east, north, ground.heights, levels[1:], **lines)
+    label = f"ground, a line every {step:g} m"
+    ax.plot([], [], color=CONTOUR_COLOUR, lw=1.2, label=label)
 
 
 def _floor(arena: Arena) -> tuple[tuple[float, float], float, float]:

@@ -22,8 +22,10 @@ from airl_mav.arena.gates import (
     with_walls,
 )
 from airl_mav.arena.geometry import Arena, Bounds, Building, Obstacles, PlacedMesh, Tour
+from airl_mav.arena.ground import Ground
+from airl_mav.arena.hills import draw_ground, stand_on
 from airl_mav.arena.own import generate_own
-from airl_mav.arena.passage import free_share, least_gap_m, passage_exists
+from airl_mav.arena.passage import Hills, free_share, least_gap_m, passage_exists
 from airl_mav.arena.placement import TRIES, NoRoomError, place_all
 from airl_mav.arena.rooms import Plan, draw_plan, room_walls, standing_on_the_floor
 from airl_mav.arena.tours import draw_tours
@@ -31,6 +33,7 @@ from airl_mav.arena.zones import draw_goal, zone_radius_m
 from airl_mav.core.errors import UsageError
 from airl_mav.core.seeding import seeded
 from airl_mav.profiles.arena import OBSTACLES, ArenaSpec
+from airl_mav.profiles.rooms import HEADROOM_M
 
 LAYOUTS = 20
 """Whole layouts drawn before a request is refused."""
@@ -49,6 +52,7 @@ class _Stream(IntEnum):
     GATES = 4
     HEIGHT = 5
     ROOMS = 6
+    TERRAIN = 7
 
 
 @dataclass(frozen=True)
@@ -64,6 +68,8 @@ class _Request:
     """Of the gates."""
     plan: Plan | None
     """Of the rooms."""
+    ground: Ground | None
+    """Where it rises above the floor; None: nowhere."""
 
     @cached_property
     def walls(self) -> Obstacles:
@@ -84,6 +90,13 @@ class _Request:
         if self.plan is None:
             return None
         return Building(len(self.plan.rooms), len(self.plan.doors), len(self.walls))
+
+    @property
+    def hills(self) -> Hills | None:
+        """Ground that is in the way of what flies at the flight altitude; None: none is."""
+        if self.ground is None:
+            return None
+        return Hills(self.ground, self.spec.flight_altitude_m - HEADROOM_M)
 
     @cached_property
     def start_box(self) -> Boxes:
@@ -120,6 +133,11 @@ def generate(
     request = _Request(
         openings=openings,
         plan=_draw_rooms(spec, seed, bounds, name, vehicle_width_m),
+        ground=(
+            draw_ground(_rng(seed, _Stream.TERRAIN), spec.terrain, bounds)
+            if spec.terrain.drawn
+            else None
+        ),
         spec=spec,
         bounds=bounds,
         counts=_draw_counts(spec, seed),
@@ -150,9 +168,10 @@ def generate(
             appearance=spec.appearance,
             meshes=meshes,
             statics=request.with_walls(statics, static),
-            goal_height_m=_draw_height(seed, spec),
+            goal_height_m=_draw_height(request, seed, goal),
             n_gates=len(openings),
             building=request.building,
+            ground=request.ground,
         )
     raise UsageError(f"arena {name!r}, seed {seed}: {failure} (best of {LAYOUTS} layouts)")
 
@@ -235,12 +254,16 @@ def _check_openings(openings: Openings, name: str, seed: int, vehicle_width_m: f
         )
 
 
-def _draw_height(seed: int, spec: ArenaSpec) -> float | None:
-    """Return the height of the goal [m]; None: it has none."""
+def _draw_height(request: _Request, seed: int, goal: Floats) -> float | None:
+    """Return the height of the goal at a place (2,) above the floor [m]; None: it has none."""
+    spec = request.spec
     if spec.goal.height_m is None:
         return None
     low, high = spec.goal.height_m
-    return low if low == high else float(_rng(seed, _Stream.HEIGHT).uniform(low, high))
+    height_m = low if low == high else float(_rng(seed, _Stream.HEIGHT).uniform(low, high))
+    if request.ground is not None:
+        height_m += request.ground.height_at(float(goal[0]), float(goal[1]))
+    return height_m
 
 
 def _draw_static(
@@ -275,8 +298,12 @@ def _draw_static(
             f"{spec.size.east_m:g} m floor",
             error.progress,
         ) from None
+    standing = Boxes(places, bodies.bounding_half)
+    static = bodies.at(places)
     meshes = bodies.meshes_at(places) if isinstance(bodies, Things) else ()
-    return bodies.at(places), Boxes(places, bodies.bounding_half), statics, meshes
+    if request.ground is not None:
+        static, meshes = stand_on(request.ground, static, standing, statics, meshes)
+    return static, standing, statics, meshes
 
 
 def _draw_reachable_goal(
@@ -307,11 +334,14 @@ def _draw_reachable_goal(
                 f"goal.clearance_m {spec.goal.clearance_m:g}, among {len(static)} static obstacles",
                 progress,
             )
-        if passage_exists(request.bounds, static, goal, request.vehicle_width_m, boxes):
+        if passage_exists(
+            request.bounds, static, goal, request.vehicle_width_m, boxes, request.hills
+        ):
             return goal
+    hills = "" if request.ground is None else " and hills"
     raise NoRoomError(
         f"no way {request.vehicle_width_m:g} m wide from the start to the goal among "
-        f"{len(static)} static obstacles",
+        f"{len(static)} static obstacles{hills}",
         progress,
     )
 

@@ -1,7 +1,8 @@
 """A concrete arena as plain arrays: what the plant, the camera, training and the report share.
 
 Frame: local NED, origin at the vehicle's start on the floor, x north. The floor is z = 0; heights
-are negative z. The four walls stand on the edges of `bounds`.
+are negative z. The four walls stand on the edges of `bounds`. Hills rise above the floor where
+there is a `ground`.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.arena.appearance import OBSTACLE, WALLS, Drawn, Statics, draw_appearance
+from airl_mav.arena.ground import Ground
 from airl_mav.arena.indoors import indoors
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.goals import Goal
@@ -78,6 +80,8 @@ class PlacedMesh:
     """The first of the obstacles that stand for it. It has the number and the material of this."""
     count: int
     """Number of these obstacles, one after the other."""
+    base_m: float = 0.0
+    """Height of its place above the floor [m]."""
 
 
 @dataclass(frozen=True)
@@ -124,6 +128,8 @@ class Arena:
     """The boxes of so many gates are the last of those obstacles that stand (`arena.gates`)."""
     building: Building | None = None
     """Of its rooms; None: it is not divided into any."""
+    ground: Ground | None = None
+    """Where it rises above the floor; None: nowhere."""
 
     @property
     def goal_point(self) -> Goal:

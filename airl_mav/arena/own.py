@@ -51,6 +51,12 @@ def _problem(arena: Arena) -> str | None:
     for mesh in arena.meshes:
         if not 0 <= mesh.first < mesh.first + mesh.count <= arena.n_static or mesh.scale <= 0.0:
             return f"meshes: accepted: each with obstacles that stand, and a scale > 0; not {mesh}"
+    if (ground := arena.ground) is not None:
+        heights = np.asarray(ground.heights)
+        if heights.ndim != 2 or min(heights.shape) < 2 or not (heights >= 0.0).all():
+            return f"ground.heights {heights.shape}; accepted: two or more each way, none below 0"
+        if not (np.isfinite(heights).all() and min(ground.step_north, ground.step_east) > 0.0):
+            return "ground: accepted: finite heights, and steps > 0"
     for what, place in (("start", (0.0, 0.0)), ("goal", tuple(np.asarray(arena.goal)))):
         inside = len(place) == 2 and (
             b.north_min < place[0] < b.north_max and b.east_min < place[1] < b.east_max

@@ -1,11 +1,13 @@
 """Is there a way, wide enough for the vehicle, from the start to the goal? Never a wrong yes.
 
-Only what stands counts: walls and static obstacles, at their full footprint.
+Only what stands counts: walls, static obstacles, at their full footprint, and hills that rise above
+a height.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -13,6 +15,7 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.footprints import Boxes, Floats, bounding_boxes, inner, outside
 from airl_mav.arena.geometry import Bounds, Obstacles, Shape
+from airl_mav.arena.ground import STEEPEST, Ground
 from airl_mav.core.kernels import kernel
 
 CELL_M = 0.25
@@ -21,17 +24,32 @@ CELL_M = 0.25
 CELLS_MAX = 250_000
 
 
+class Hills(NamedTuple):
+    """Ground that is in the way where it rises above a height."""
+
+    ground: Ground
+    most_m: float
+    """Ground that is no higher can be flown over [m]."""
+
+
 def passage_exists(
-    bounds: Bounds, obstacles: Obstacles, goal: Floats, width_m: float, boxes: Boxes | None = None
+    bounds: Bounds,
+    obstacles: Obstacles,
+    goal: Floats,
+    width_m: float,
+    boxes: Boxes | None = None,
+    hills: Hills | None = None,
 ) -> bool:
     """Return whether a disc `width_m` [m] wide can be moved from the origin to `goal` (2,) [m].
 
     `boxes` has all obstacles in it, several of them in one where they are parts of one thing;
-    None: each is in a box of its own.
+    None: each is in a box of its own. `hills` are passed by at the side; None: there are none.
     """
-    return gaps_suffice(bounds, obstacles, goal, width_m, boxes) or raster_passage(
-        bounds, obstacles, goal, width_m
-    )
+    if hills is not None and hills.ground.top_m <= hills.most_m:
+        hills = None
+    if hills is None and gaps_suffice(bounds, obstacles, goal, width_m, boxes):
+        return True
+    return raster_passage(bounds, obstacles, goal, width_m, hills)
 
 
 def gaps_suffice(
@@ -85,7 +103,13 @@ def _cell_m(bounds: Bounds) -> float:
     return max(CELL_M, math.sqrt(area / CELLS_MAX))
 
 
-def raster_passage(bounds: Bounds, obstacles: Obstacles, goal: Floats, width_m: float) -> bool:
+def raster_passage(
+    bounds: Bounds,
+    obstacles: Obstacles,
+    goal: Floats,
+    width_m: float,
+    hills: Hills | None = None,
+) -> bool:
     """Return whether free cells join the start's cell to the goal's, stepping along the axes.
 
     A cell is free when its centre keeps half the width plus half a cell diagonal from everything:
@@ -100,6 +124,8 @@ def raster_passage(bounds: Bounds, obstacles: Obstacles, goal: Floats, width_m: 
     free_north = (north - bounds.north_min > margin) & (bounds.north_max - north > margin)
     free_east = (east - bounds.east_min > margin) & (bounds.east_max - east > margin)
     free = free_north[:, None] & free_east
+    if hills is not None:
+        free &= _to_hills(hills, north, east, cell) > margin
     boxes = bounding_boxes(obstacles)
     for i in range(len(obstacles)):
         reach = boxes.half[i] + margin
@@ -110,6 +136,21 @@ def raster_passage(bounds: Bounds, obstacles: Obstacles, goal: Floats, width_m: 
     start = label[-south, -west]
     end = label[round(float(goal[0]) / cell) - south, round(float(goal[1]) / cell) - west]
     return bool(start != 0 and start == end)
+
+
+def _to_hills(hills: Hills, north: Floats, east: Floats, cell: float) -> Floats:
+    """Return how far (rows, columns) [m] cells surely are from ground that is in the way.
+
+    A point of such ground lies in a cell whose centre is hardly lower: by what it rises, at its
+    steepest, over half the cell's diagonal.
+    """
+    half_diagonal = cell / math.sqrt(2.0)
+    low = hills.most_m - half_diagonal * float(hills.ground.relief.grid[STEEPEST])
+    high = hills.ground.sampled(north, east) > low
+    if not high.any():
+        return np.full(high.shape, math.inf)
+    away: Floats = scipy.ndimage.distance_transform_edt(~high, sampling=cell)
+    return away - half_diagonal
 
 
 def free_share(bounds: Bounds, obstacles: Obstacles, count: int) -> float:

@@ -65,7 +65,7 @@ def standing(placed: PlacedMesh) -> tuple[NDArray[np.float64], NDArray[np.int32]
     held = triangles_of(placed.file)
     cos, sin = math.cos(placed.yaw), math.sin(placed.yaw)
     turn = placed.scale * np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
-    places: NDArray[np.float64] = held.vertices @ turn + [*placed.place, 0.0]
+    places: NDArray[np.float64] = held.vertices @ turn + [*placed.place, -placed.base_m]
     return places, held.faces
 
 

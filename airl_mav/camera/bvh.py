@@ -15,10 +15,16 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.arena.appearance import FLOOR as FLOOR_ROW
+from airl_mav.arena.appearance import OBSTACLE as OBSTACLE_ROW
 from airl_mav.arena.geometry import PlacedMesh
+from airl_mav.arena.ground import Ground, Relief, no_relief, plane_at
 from airl_mav.arena.triangles import KEPT, Triangles, triangles_of
+from airl_mav.camera.primitives import GROUND, OBSTACLE
+from airl_mav.camera.projection import MIN_DEPTH_M
 from airl_mav.core.kernels import kernel, large_kernel
 from airl_mav.profiles.mesh_file import MeshFile
+from airl_mav.vehicle.rotation import Vec
 
 BINS: Final = 16
 """Places of splits along an axis."""
@@ -216,19 +222,37 @@ def bvh_of(file: MeshFile) -> Bvh:
     return build_bvh(triangles_of(file))
 
 
+@lru_cache(maxsize=KEPT)
+def ground_tree(ground: Ground) -> Bvh:
+    """Return the tree of the triangles of ground.
+
+    Their axes are east, south and down from the start: `GROUND_POSE` turns them. So the floor's
+    pattern goes on over the hills, which begins along these (`surfaces.shade_floor`).
+    """
+    corners = ground.points[:, [1, 0, 2]] * (1.0, -1.0, 1.0)
+    return build_bvh(Triangles(corners.astype(np.float32), ground.faces))
+
+
 class Forest(NamedTuple):
-    """The trees of several meshes, and where each begins."""
+    """The trees of several meshes, and where each begins; None: that of the ground."""
 
     bvh: Bvh
-    roots: dict[MeshFile, int]
+    roots: dict[MeshFile | None, int]
 
 
 @lru_cache(maxsize=4)
-def forest_of(files: tuple[MeshFile, ...]) -> Forest:
-    """Return the trees of meshes in one. Raises UsageError as `triangles_of`."""
+def forest_of(files: tuple[MeshFile, ...], ground: Ground | None = None) -> Forest:
+    """Return the trees of meshes, and of the ground, in one. Raises UsageError as `triangles_of`.
+
+    There is one at least.
+    """
+    names: list[MeshFile | None] = [*files]
     trees = [bvh_of(file) for file in files]
+    if ground is not None:
+        names.append(None)
+        trees.append(ground_tree(ground))
     if len(trees) == 1:
-        return Forest(trees[0], {files[0]: 0})
+        return Forest(trees[0], {names[0]: 0})
     nodes = np.cumsum([0, *(len(tree.boxes) for tree in trees)])
     faces = np.cumsum([0, *(len(tree.corners) for tree in trees)])
     links = []
@@ -242,17 +266,52 @@ def forest_of(files: tuple[MeshFile, ...]) -> Forest:
         np.concatenate([tree.corners for tree in trees]),
         np.concatenate([tree.normals for tree in trees]),
     )
-    return Forest(bvh, dict(zip(files, nodes.tolist(), strict=False)))
+    return Forest(bvh, dict(zip(names, nodes.tolist(), strict=False)))
+
+
+GROUND_FIRST: Final = GROUND - OBSTACLE
+"""`Meshes.first` of the ground."""
+
+GROUND_POSE: Final = (0.0, 0.0, 0.0, 1.0, 1.0, 0.0)
+"""`Meshes.pose` of the ground: its first axis is east."""
 
 
 class Meshes(NamedTuple):
-    """The meshes of an arena as kernels take them: k that stand somewhere."""
+    """The meshes of an arena as kernels take them: k that stand somewhere.
+
+    Hills are one of them, the last, which no obstacle is a part of.
+    """
 
     bvh: Bvh
     owner: NDArray[np.int32]  # (n,) the mesh that each obstacle is a part of, -1: of none
-    first: NDArray[np.int32]  # (k,) the obstacle whose number and material it has
+    first: NDArray[np.int32]  # (k,) the obstacle whose number and material it has; GROUND_FIRST
     root: NDArray[np.int32]  # (k,) root of its tree
-    pose: NDArray[np.float64]  # (k, 5) north, east [m], cosine and sine of its heading, scale
+    pose: NDArray[np.float64]
+    """(k, 6) north, east [m], cosine and sine of its heading, scale, down [m]."""
+    relief: Relief
+    """What is ground of them."""
+
+
+@kernel
+def count_of(meshes: Meshes | None) -> int:
+    """Return how many meshes there are."""
+    return 0 if meshes is None else len(meshes.first)
+
+
+@kernel
+def material_row(meshes: Meshes, k: int) -> int:
+    """Return the row of mesh k's material in `Finish`."""
+    first = meshes.first[k]
+    return FLOOR_ROW if first == GROUND_FIRST else OBSTACLE_ROW + first
+
+
+@kernel
+def raised(meshes: Meshes | None, position: Vec | NDArray[np.float64]) -> Vec:
+    """Return a camera's place NED [m], raised to `MIN_DEPTH_M` above the ground below it."""
+    lowest = -MIN_DEPTH_M
+    if meshes is not None:
+        lowest -= plane_at(meshes.relief, position[0], position[1])[0]
+    return (position[0], position[1], min(position[2], lowest))
 
 
 @kernel
@@ -261,30 +320,34 @@ def is_owned(meshes: Meshes | None, i: int) -> bool:
     return False if meshes is None else meshes.owner[i] >= 0
 
 
-def meshes_of(placed: tuple[PlacedMesh, ...], n_obstacles: int) -> Meshes | None:
-    """Return the meshes of an arena; None: it has none.
+def meshes_of(
+    placed: tuple[PlacedMesh, ...], n_obstacles: int, ground: Ground | None = None
+) -> Meshes | None:
+    """Return the meshes of an arena, hills among them; None: it has none.
 
     Raises:
         UsageError: The file of one cannot be read, or is another one.
     """
-    if not placed:
+    if not placed and ground is None:
         return None
-    forest = forest_of(tuple(dict.fromkeys(each.file for each in placed)))
-    return Meshes(forest.bvh, *placed_in(forest, placed, n_obstacles))
+    forest = forest_of(tuple(dict.fromkeys(each.file for each in placed)), ground)
+    rows = placed_in(forest.roots, placed, n_obstacles)
+    return Meshes(forest.bvh, *rows, no_relief() if ground is None else ground.relief)
 
 
 def placed_in(
-    forest: Forest, placed: tuple[PlacedMesh, ...], n_obstacles: int
+    roots: dict[MeshFile | None, int], placed: tuple[PlacedMesh, ...], n_obstacles: int
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32], NDArray[np.float64]]:
-    """Return `owner`, `first`, `root` and `pose` of `Meshes`."""
+    """Return `owner`, `first`, `root` and `pose` of `Meshes`; hills where `roots` has them."""
     owner = np.full(n_obstacles, -1, np.int32)
     for k, each in enumerate(placed):
         owner[each.first : each.first + each.count] = k
-    return (
-        owner,
-        np.array([each.first for each in placed], np.int32),
-        np.array([forest.roots[each.file] for each in placed], np.int32),
-        np.array(
-            [(*each.place, math.cos(each.yaw), math.sin(each.yaw), each.scale) for each in placed]
-        ).reshape(len(placed), 5),
-    )
+    first = [each.first for each in placed]
+    root = [roots[each.file] for each in placed]
+    pose = [
+        (*each.place, math.cos(each.yaw), math.sin(each.yaw), each.scale, -each.base_m)
+        for each in placed
+    ]
+    if None in roots:
+        first, root, pose = [*first, GROUND_FIRST], [*root, roots[None]], [*pose, GROUND_POSE]
+    return owner, np.array(first, np.int32), np.array(root, np.int32), np.array(pose).reshape(-1, 6)

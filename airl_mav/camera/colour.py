@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from airl_mav.arena.appearance import FLOOR as FLOOR_ROW
 from airl_mav.arena.appearance import OBSTACLE as OBSTACLE_ROW
 from airl_mav.arena.appearance import WALLS as WALLS_ROW
-from airl_mav.camera.bvh import Meshes, is_owned
+from airl_mav.camera.bvh import Meshes, count_of, is_owned, raised
 from airl_mav.camera.mesh_shadows import shade_by_meshes
 from airl_mav.camera.mesh_surfaces import shade_meshes
-from airl_mav.camera.primitives import OBSTACLE, SKY, Ids
+from airl_mav.camera.primitives import FLOOR, GROUND, OBSTACLE, SKY, Ids
 from airl_mav.camera.projection import MIN_DEPTH_M, Bent, Pose
 from airl_mav.camera.raycast import aim, blank, draw_bodies, invert
 from airl_mav.camera.shading import F32, ZERO, Lit, Packed, Plane, Points, Rays, surface_of
@@ -110,7 +110,8 @@ def render_colour(
         depth: (height, width) depth [m] as `render_depth` defines it, without a limit of range,
             written; 0: no surface.
         seen: (height, width) what each pixel sees, written: CEILING, SKY, ... of `primitives`, for
-            an obstacle OBSTACLE + its number, for a mesh that of the first obstacle it owns.
+            an obstacle OBSTACLE + its number, for a mesh that of the first obstacle it owns, for
+            hills FLOOR.
         work: For this size of image.
         position: As of `render_depth`, with the rest up to `meshes`.
         quaternion: (4,).
@@ -133,11 +134,11 @@ def render_colour(
         atlas: `textures.atlas()`.
         bent: As of `render_depth`.
     """
-    camera = (position[0], position[1], min(position[2], -MIN_DEPTH_M))
+    camera = raised(meshes, position)
     lines, xs = work.lines, work.xs
     view, axes = aim(lines, xs, quaternion, focal, cx, cy, cylindrical, RANGE_M)
     far, ids = (work.far, work.ids) if cylindrical else (depth, seen)
-    rectangles = np.zeros((len(shape), 3, 4), np.int32)
+    rectangles = np.zeros((len(shape) + count_of(meshes), 3, 4), np.int32)
     faces = None if meshes is None else np.empty(far.shape, np.int32)
     inside = draw_bodies(
         far, ids, rectangles, lines, xs, bent, view, axes, camera, bounds, shape, center, half_size,
@@ -203,9 +204,19 @@ def render_colour(
     if bent is not None:
         _blacken(out, bent)
     unpack(rgb, out, cylindrical)
+    _tell_ground(all_ids, meshes)
     if cylindrical:
         depth[:, :] = far.T
         seen[:, :] = ids.T
+
+
+@kernel
+def _tell_ground(ids: Ids, meshes: Meshes | None) -> None:
+    """Write the floor's number (n,) where hills are seen."""
+    if meshes is None:
+        return
+    for at in range(len(ids)):
+        ids[at] = FLOOR if ids[at] == GROUND else ids[at]
 
 
 @kernel

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.appearance import OBSTACLE as OBSTACLE_ROW
-from airl_mav.camera.bvh import Meshes
+from airl_mav.camera.bvh import Meshes, material_row
 from airl_mav.camera.mesh_triangles import Faces
 from airl_mav.camera.primitives import OBSTACLE, Ids, Line, Lines, Rectangles, turned
 from airl_mav.camera.projection import Bent, Pose
@@ -66,7 +65,7 @@ def shade_meshes(
         lit: (n,) 1 in the sun, 0 in shadow.
         clear: (n,) share of light that the fog lets through.
         points: Room to work in.
-        rectangles: (obstacles, 3, 4) of each mesh's first obstacle the pixels, in its first place.
+        rectangles: (obstacles + meshes, 3, 4) of each mesh the pixels, in its first place.
         meshes: Those of the arena.
         faces: (n,) which of its triangles is seen.
         lines: Of the image.
@@ -83,11 +82,11 @@ def shade_meshes(
         pixel2: Square of the side of a pixel at a depth of 1.
     """
     for k in range(len(meshes.first)):
-        i = meshes.first[k]
-        surface = surface_of(texture, per_m, offset, albedo, OBSTACLE_ROW + i)
+        rectangle = rectangles[len(meshes.owner) + k, 0]
+        surface = surface_of(texture, per_m, offset, albedo, material_row(meshes, k))
         _shade_mesh(
-            out, ids, far, lit, clear, points, rectangles[i, 0], meshes, k, faces, lines, xs, bent,
-            axes, camera, surface, light, atlas, pixel2,
+            out, ids, far, lit, clear, points, rectangle, meshes, k, faces, lines, xs, bent, axes,
+            camera, surface, light, atlas, pixel2,
         )  # fmt: skip
 
 
@@ -115,7 +114,11 @@ def _shade_mesh(
 ) -> None:
     """Shade what is seen of mesh k in a rectangle (4,) of the image."""
     cos, sin = meshes.pose[k, 2], meshes.pose[k, 3]
-    offset = (meshes.pose[k, 0] - camera[0], meshes.pose[k, 1] - camera[1], -camera[2])
+    offset = (
+        meshes.pose[k, 0] - camera[0],
+        meshes.pose[k, 1] - camera[1],
+        meshes.pose[k, 5] - camera[2],
+    )
     pose = turned(Pose(axes.forward, axes.across, axes.along, offset), cos, sin)
     c0, c1, c2 = F32(pose.center[0]), F32(pose.center[1]), F32(pose.center[2])
     r = along32(pose)

@@ -52,7 +52,7 @@ def seen_from(axes: Pose, camera: Vec, pose: NDArray[np.float64], k: int) -> Pos
         k: Number of the mesh.
     """
     per = 1.0 / pose[k, 4]
-    offset = (pose[k, 0] - camera[0], pose[k, 1] - camera[1], -camera[2])
+    offset = (pose[k, 0] - camera[0], pose[k, 1] - camera[1], pose[k, 5] - camera[2])
     at = (per * offset[0], per * offset[1], per * offset[2])
     return turned(Pose(axes.forward, axes.across, axes.along, at), pose[k, 2], pose[k, 3])
 
@@ -77,8 +77,8 @@ def draw_meshes(
         out: (n, m) inverse depth [1/m], changed.
         ids: (n, m) what each pixel sees, changed; None: nobody asks.
         faces: (n, m) the triangle that each pixel sees, written where it sees one; None as `ids`.
-        drawn_in: (obstacles, 3, 4) written for the first obstacle of each mesh, in its first place:
-            the rectangle that it may be seen in; None as `ids`.
+        drawn_in: (obstacles + meshes, 3, 4) written behind the obstacles, in the first place of
+            each: the rectangle that a mesh may be seen in; None as `ids`.
         lines: Of the image, with the next two.
         xs: Rays of a line.
         bent: A fisheye's rays, in place of both; None: it is another image.
@@ -91,7 +91,7 @@ def draw_meshes(
     nearest = np.empty(STACK)
     for k in range(len(meshes.root)):
         number = meshes.first[k]
-        kept = None if drawn_in is None else drawn_in[number, 0]
+        kept = None if drawn_in is None else drawn_in[len(meshes.owner) + k, 0]
         pose = seen_from(axes, camera, meshes.pose, k)
         scale = meshes.pose[k, 4]
         if bent is None:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.appearance import FLOOR, OBSTACLE, TEXTURES, WALLS, Finish, Light, srgb_of
 from airl_mav.arena.geometry import Arena, PlacedMesh, Shape
+from airl_mav.arena.ground import Ground
 from airl_mav.arena.triangles import standing, triangles_of
 from airl_mav.camera.colour import RANGE_M
 from airl_mav.camera.cube_faces import FACES, Cube, cube_of, resampled, side_for
@@ -215,6 +216,8 @@ def _bodies(mi: Any, arena: Arena, centers: Floats) -> dict[str, Any]:
         made.append(
             _ceiling(mi, arena.look.light, np.array([north, east, -b.height]), half_n, half_e)
         )
+    if arena.ground is not None:
+        made.append(_hills(mi, finish, arena.ground))
     for each in arena.meshes:
         made.append(_mesh(mi, finish, OBSTACLE + each.first, each))
     for i in range(len(o)):
@@ -322,8 +325,28 @@ def _sphere(mi: Any, finish: Finish, row: int, center: Floats, radius: float) ->
 
 def _mesh(mi: Any, finish: Finish, row: int, placed: PlacedMesh) -> Any:
     """Return a mesh of flat triangles. Its pattern lies on them as `mesh_surfaces` has it."""
-    held = triangles_of(placed.file)
-    corners = placed.scale * held.corners.astype(np.float64)
+    vertices, faces = standing(placed)
+    corners = placed.scale * triangles_of(placed.file).corners.astype(np.float64)
+    return _triangles(mi, finish, row, corners, vertices[faces])
+
+
+def _hills(mi: Any, finish: Finish, ground: Ground) -> Any:
+    """Return hills, whose pattern goes on from the floor's: across is east, along is south."""
+    corners = ground.points[ground.faces]
+    own = corners[..., [1, 0, 2]] * (1.0, -1.0, 1.0)
+    return _triangles(mi, finish, FLOOR, own, corners)
+
+
+def _triangles(mi: Any, finish: Finish, row: int, corners: Floats, placed: Floats) -> Any:
+    """Return flat triangles whose pattern lies on them as `mesh_surfaces` has it.
+
+    Args:
+        mi: Mitsuba.
+        finish: The materials.
+        row: Which of them.
+        corners: (m, 3, 3) along the axes of the mesh [m].
+        placed: (m, 3, 3) the same NED [m].
+    """
     normals = np.abs(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     q0, q1, q2 = normals.T[..., None]
     level = q2 >= np.maximum(q0, q1)
@@ -333,11 +356,10 @@ def _mesh(mi: Any, finish: Finish, row: int, placed: PlacedMesh) -> Any:
     places = _per_m(finish, row) * np.stack([across, along], axis=-1) + finish.offset[row]
     properties = mi.Properties()
     properties["mesh_bsdf"] = mi.load_dict(_material(mi, finish, row, (1.0, 1.0), (0.0, 0.0)))
-    count = len(held)
+    count = len(corners)
     mesh = mi.Mesh("mesh", 3 * count, count, has_vertex_texcoords=True, props=properties)
-    vertices, faces = standing(placed)
     data = mi.traverse(mesh)
-    data["vertex_positions"] = vertices[faces].astype(np.float32).ravel()
+    data["vertex_positions"] = placed.astype(np.float32).ravel()
     data["vertex_texcoords"] = places.astype(np.float32).ravel()
     data["faces"] = np.arange(3 * count, dtype=np.uint32)
     data.update()

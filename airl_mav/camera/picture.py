@@ -103,7 +103,7 @@ def render_picture(
         centers,
         obstacles.half_size,
         obstacles.yaw,
-        meshes_of(arena.meshes, len(obstacles)),
+        meshes_of(arena.meshes, len(obstacles), arena.ground),
         look.texture,
         look.per_m,
         look.offset,

@@ -19,6 +19,9 @@ from airl_mav.vehicle.rotation import Vec
 BOX: Final = int(Shape.BOX)
 CYLINDER: Final = int(Shape.CYLINDER)
 
+GROUND: Final = -2
+"""What sees hills while an image is drawn; where it is told of, they are the floor."""
+
 CEILING: Final = -1
 SKY: Final = 0
 FLOOR: Final = 1

@@ -23,7 +23,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.camera.bvh import Meshes, is_owned
+from airl_mav.camera.bvh import Meshes, is_owned, raised
 from airl_mav.camera.mesh_triangles import Faces
 from airl_mav.camera.meshes import draw_meshes
 from airl_mav.camera.primitives import (
@@ -205,10 +205,10 @@ def draw_bodies(
 
     Args:
         out: (n, m) inverse depth [1/m], written.
-        ids: (n, m) written: what each pixel sees, CEILING, SKY, ... or OBSTACLE + its number; None:
-            nobody asks, and nothing is spent on it.
-        drawn_in: (obstacles, 3, 4) written: the rectangles that each obstacle was drawn in; None:
-            nobody asks.
+        ids: (n, m) written: what each pixel sees, CEILING, SKY, ... or OBSTACLE + its number, or
+            GROUND where that is hills; None: nobody asks, and nothing is spent on it.
+        drawn_in: (obstacles + meshes, 3, 4) written: the rectangles that each obstacle, and each
+            mesh, was drawn in; None: nobody asks.
         lines: Of `aim`, with the next three.
         xs: Rays of a line.
         bent: A fisheye's rays, in place of both; None: it is another image.
@@ -275,7 +275,7 @@ def render_depth(
 
     The floor is the rectangle of the bounds at z = 0. The walls are thin, stand on its edges and
     are seen from both sides; a ray that passes over them has no return, unless there is a ceiling
-    at their height. A camera less than `MIN_DEPTH_M` above the floor is lifted to that height (a
+    at their height. A camera less than `MIN_DEPTH_M` above the ground is lifted to that height (a
     resting vehicle sinks in by the contact's penetration). From inside an obstacle every pixel
     reads `MIN_DEPTH_M`. In place of the obstacles that a mesh owns its triangles are seen, from
     inside as well.
@@ -296,10 +296,11 @@ def render_depth(
         center: (n, 3) NED [m].
         half_size: (n, 3) as in `Obstacles` [m].
         yaw: (n,) heading of a box's first axis [rad].
-        meshes: Those that are seen; None: there are none, and nothing is spent on them.
+        meshes: Those that are seen, hills among them; None: there are none, and nothing is spent on
+            them.
         bent: The rays of a fisheye (`fisheye.bent_of`); None: it is a pinhole or a cylinder.
     """
-    camera = (position[0], position[1], min(position[2], -MIN_DEPTH_M))
+    camera = raised(meshes, position)
     height, width = out.shape
     xs = np.empty(height if cylindrical else width)
     lines = np.empty((width if cylindrical else height, 2))

@@ -124,7 +124,7 @@ def render(
         centers,
         obstacles.half_size,
         obstacles.yaw,
-        meshes_of(arena.meshes, len(obstacles)),
+        meshes_of(arena.meshes, len(obstacles), arena.ground),
         bent_of(k),
     )
     return image

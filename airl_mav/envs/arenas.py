@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena
+from airl_mav.arena.ground import COLUMNS, GRID_SIZE, ROWS, Relief
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.kernels import kernel
 
@@ -29,10 +30,12 @@ class ArenaBatch(NamedTuple):
     tour_period_s: NDArray[np.float64]  # (n, movers)
     tour_speed: NDArray[np.float64]  # (n,) greatest speed of any mover [m/s]
     goal: NDArray[np.float64]  # (n, 3) north, east, down [m]; down is NaN where it has no height
+    heights: NDArray[np.float64]  # (n, h) `Relief.heights` of each
+    grid: NDArray[np.float64]  # (n, GRID_SIZE) `Relief.grid`; no rows: the ground is the floor
 
 
-def empty_batch(n: int, obstacles: int, movers: int, points: int) -> ArenaBatch:
-    """Return room for n arenas of at most so many obstacles, movers and way-points each."""
+def empty_batch(n: int, obstacles: int, movers: int, points: int, heights: int = 0) -> ArenaBatch:
+    """Return room for n arenas of at most so many obstacles, movers, way-points and heights."""
     return ArenaBatch(
         bounds=np.zeros((n, 6)),
         n_obstacles=np.zeros(n, np.int64),
@@ -46,6 +49,8 @@ def empty_batch(n: int, obstacles: int, movers: int, points: int) -> ArenaBatch:
         tour_period_s=np.ones((n, movers)),
         tour_speed=np.zeros(n),
         goal=np.tile((0.0, 0.0, math.nan), (n, 1)),
+        heights=np.zeros((n, heights)),
+        grid=np.zeros((n, GRID_SIZE)),
     )
 
 
@@ -57,6 +62,7 @@ def batch_of(arenas: Sequence[Arena]) -> ArenaBatch:
         max((len(arena.obstacles) for arena in arenas), default=0),
         max((len(arena.tours) for arena in arenas), default=0),
         max((len(tour.times_s) for tour in tours), default=0),
+        max((_heights_of(arena) for arena in arenas), default=0),
     )
     for i, arena in enumerate(arenas):
         put_arena(batch, i, arena)
@@ -65,9 +71,7 @@ def batch_of(arenas: Sequence[Arena]) -> ArenaBatch:
 
 def with_room(batch: ArenaBatch, arena: Arena) -> ArenaBatch:
     """Return a batch with the same arenas in which there is room for another one."""
-    room = batch.shape.shape[1], batch.tour_times_s.shape[1], batch.tour_times_s.shape[2]
-    need = _room_of(arena)
-    larger = empty_batch(len(batch.bounds), *map(max, room, need))
+    larger = empty_batch(len(batch.bounds), *map(max, _room_in(batch), _room_of(arena)))
     copy_rows(batch, larger)
     return larger
 
@@ -78,19 +82,30 @@ def copy_rows(batch: Iterable[NDArray[Any]], larger: Iterable[NDArray[Any]]) -> 
         new[tuple(map(slice, old.shape))] = old
 
 
-def _room_of(arena: Arena) -> tuple[int, int, int]:
-    """Return how many obstacles, movers and way-points an arena has."""
+def _room_of(arena: Arena) -> tuple[int, int, int, int]:
+    """Return how many obstacles, movers, way-points and heights an arena has."""
     points = max((len(tour.times_s) for tour in arena.tours), default=0)
-    return len(arena.obstacles), len(arena.tours), points
+    return len(arena.obstacles), len(arena.tours), points, _heights_of(arena)
+
+
+def _heights_of(arena: Arena) -> int:
+    """Return how many heights the ground of an arena has."""
+    return 0 if arena.ground is None else arena.ground.heights.size
+
+
+def _room_in(batch: ArenaBatch) -> tuple[int, int, int, int]:
+    """Return how many of the same there is room for in a batch."""
+    _, movers, points = batch.tour_times_s.shape
+    return batch.shape.shape[1], movers, points, batch.heights.shape[1]
 
 
 def put_arena(batch: ArenaBatch, i: int, arena: Arena) -> None:
     """Write an arena into row i. Raises ValueError when it needs more room than there is."""
     o = arena.obstacles
-    count, movers, points = _room_of(arena)
-    room = batch.shape.shape[1], batch.tour_times_s.shape[1], batch.tour_times_s.shape[2]
-    if count > room[0] or movers > room[1] or points > room[2]:
-        raise ValueError(f"arena needs {(count, movers, points)}, the batch has room for {room}")
+    need, room = _room_of(arena), _room_in(batch)
+    if any(each > most for each, most in zip(need, room, strict=True)):
+        raise ValueError(f"arena needs {need}, the batch has room for {room}")
+    count = need[0]
     batch.bounds[i] = arena.bounds.as_array()
     batch.n_obstacles[i], batch.n_static[i] = count, arena.n_static
     batch.shape[i, :count] = o.shape
@@ -100,6 +115,10 @@ def put_arena(batch: ArenaBatch, i: int, arena: Arena) -> None:
     height_m = arena.goal_height_m
     batch.goal[i, :2] = arena.goal
     batch.goal[i, 2] = math.nan if height_m is None else -height_m
+    batch.grid[i] = 0.0
+    if arena.ground is not None:
+        relief = arena.ground.relief
+        batch.heights[i, : len(relief.heights)], batch.grid[i] = relief
     batch.tour_times_s[i] = np.inf
     batch.tour_speed[i] = 0.0
     for j, tour in enumerate(arena.tours):
@@ -120,6 +139,13 @@ def _fastest(times_s: NDArray[np.float64], points: NDArray[np.float64]) -> float
         passed = times_s[k + 1] - times_s[k]
         greatest = max(greatest, (north * north + east * east) / (passed * passed))
     return math.sqrt(greatest)
+
+
+@kernel
+def relief_of(batch: ArenaBatch, i: int) -> Relief:
+    """Return the ground of arena i."""
+    grid = batch.grid[i]
+    return Relief(batch.heights[i, : int(grid[ROWS]) * int(grid[COLUMNS])], grid)
 
 
 @kernel

@@ -21,7 +21,7 @@ from airl_mav.camera.render import Mount, camera_pose
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.kernels import kernel
 from airl_mav.core.streams import Stream, stream
-from airl_mav.envs.arenas import ArenaBatch, move_obstacles
+from airl_mav.envs.arenas import ArenaBatch, move_obstacles, relief_of
 from airl_mav.envs.colour_images import ColourImages, Looks
 from airl_mav.envs.faults import BEFORE_US, TwinFault, later_us, twin_faults
 from airl_mav.envs.fleet import Fleet
@@ -361,7 +361,7 @@ def render_images(
             arenas.center[i, :count],
             arenas.half_size[i, :count],
             arenas.yaw[i, :count],
-            None if meshes is None else meshes_in(meshes, i, count),
+            None if meshes is None else meshes_in(meshes, i, count, relief_of(arenas, i)),
             lens.bent,
         )
         _to_z16(image, out[i])

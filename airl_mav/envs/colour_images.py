@@ -19,7 +19,7 @@ from airl_mav.camera.render import Mount, camera_pose
 from airl_mav.camera.textures import atlas
 from airl_mav.core.errors import UsageError
 from airl_mav.core.kernels import kernel
-from airl_mav.envs.arenas import ArenaBatch, copy_rows, move_obstacles
+from airl_mav.envs.arenas import ArenaBatch, copy_rows, move_obstacles, relief_of
 from airl_mav.envs.fleet import Fleet
 from airl_mav.envs.meshes import MeshBatch, MeshesSeen, meshes_in
 from airl_mav.profiles.image_file import ImageFile
@@ -189,7 +189,7 @@ def render_colour_images(
             arenas.center[i, :count],
             arenas.half_size[i, :count],
             arenas.yaw[i, :count],
-            None if meshes is None else meshes_in(meshes, i, count),
+            None if meshes is None else meshes_in(meshes, i, count, relief_of(arenas, i)),
             looks.texture[i, :surfaces],
             looks.per_m[i, :surfaces],
             looks.offset[i, :surfaces],

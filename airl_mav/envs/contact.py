@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Shape
+from airl_mav.arena.ground import STEEPEST, Relief, extreme_within
 from airl_mav.core.kernels import kernel
 from airl_mav.vehicle.rotation import Vec
 
@@ -33,16 +34,24 @@ def clearance(
     count: int,
     center: NDArray[np.float64],
     half_size: NDArray[np.float64],
+    relief: Relief | None = None,
 ) -> float:
     """Return a distance [m] that the vehicle may move without touching anything; below 0 = unsure.
 
-    A lower bound: obstacles count as upright cylinders around their bounding boxes. Arguments as
-    of `touches`.
+    A lower bound: obstacles count as upright cylinders around their bounding boxes. The ground is
+    nowhere steeper than its steepest triangle: what lies a height above it is so far from it, less
+    what the cosine of that slope takes. Arguments as of `touches`.
     """
     x, y, z = position
     low = z + half_height
     beside = min(min(x - bounds[0], bounds[1] - x), min(y - bounds[2], bounds[3] - y)) - radius
     room: float = min(-low, max(beside, -bounds[4] - low))
+    if relief is not None and len(relief.heights) > 0:
+        # From beyond a wall the nearest ground is that at its foot.
+        north, east = min(max(x, bounds[0]), bounds[1]), min(max(y, bounds[2]), bounds[3])
+        above = -low - extreme_within(relief, north, east, radius, 1.0)
+        steepest = relief.grid[STEEPEST]
+        room = min(room, above / math.sqrt(1.0 + steepest * steepest))
     if bounds[5] > 0.0:
         room = min(room, bounds[4] + z - half_height)
     for i in range(count):
@@ -64,6 +73,7 @@ def touches(
     center: NDArray[np.float64],
     half_size: NDArray[np.float64],
     yaw: NDArray[np.float64],
+    relief: Relief | None = None,
 ) -> int:
     """Return the index of the obstacle that the vehicle overlaps, or FLOOR, CEILING, WALL, NOTHING.
 
@@ -77,9 +87,13 @@ def touches(
         center: (m, 3) NED [m].
         half_size: (m, 3) [m].
         yaw: (m,) [rad].
+        relief: The ground, which is the floor where it rises; None: it does nowhere.
     """
     x, y, z = position
     if z + half_height > 0.0:
+        return FLOOR
+    # Beyond the walls, and without hills, it is minus infinity: there the floor is level.
+    if relief is not None and z + half_height > -extreme_within(relief, x, y, radius, 1.0):
         return FLOOR
     if bounds[5] > 0.0 and z - half_height < -bounds[4]:
         return CEILING

@@ -33,7 +33,7 @@ from airl_mav.control.memory import MEMORY_SIZE, SAT, WAIT
 from airl_mav.control.mixer import allocate, desaturate
 from airl_mav.core.constants import TICK_S, TICK_US
 from airl_mav.core.kernels import kernel
-from airl_mav.envs.arenas import ArenaBatch, move_obstacles
+from airl_mav.envs.arenas import ArenaBatch, move_obstacles, relief_of
 from airl_mav.envs.contact import NOTHING, clearance, touches
 from airl_mav.envs.fleet import Fleet, Rules, Vehicle, Verdict
 from airl_mav.envs.lanes import (
@@ -423,9 +423,10 @@ def _contact(
     shape, center = arenas.shape[i], arenas.center[i]
     half_size, yaw = arenas.half_size[i], arenas.yaw[i]
     radius, half_height = vehicle.radius, vehicle.half_height
-    room = clearance(position, radius, half_height, bounds, count, center, half_size)
+    relief = relief_of(arenas, i)
+    room = clearance(position, radius, half_height, bounds, count, center, half_size, relief)
     if room > _ROUNDING_M:
         return room, NOTHING
     return room, touches(
-        position, radius, half_height, bounds, count, shape, center, half_size, yaw
+        position, radius, half_height, bounds, count, shape, center, half_size, yaw, relief
     )

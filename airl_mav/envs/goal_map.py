@@ -1,5 +1,7 @@
 """The map of an episode: how far what stands is from each place, and how long the goal is from it.
 
+Ground that rises to the height of the flight is in the way as an obstacle is.
+
 The time to go is that of the best way, which keeps a distance where there is room: the eikonal
 equation, solved by fast sweeping (Zhao, Math. Comp. 74(250), 2005).
 """
@@ -10,11 +12,13 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Shape
+from airl_mav.arena.ground import TOP, extreme_within
 from airl_mav.core.kernels import kernel
-from airl_mav.envs.arenas import ArenaBatch
+from airl_mav.envs.arenas import ArenaBatch, relief_of
 
 CELLS = 125
 """Cells of the map along the longer side of an arena, at most."""
@@ -31,6 +35,10 @@ SLOWEST = 0.25
 BLOCKED = 0.02
 """The same where it does not: small, so that the way out is still downhill."""
 
+OVER_M = 0.3
+"""What is lower than the vehicle's lower side by this, or higher than its upper, is not in the way
+[m]."""
+
 _BOX = int(Shape.BOX)
 
 FAR = 1e9
@@ -46,7 +54,7 @@ class Map(NamedTuple):
     cell: float
     """Side of a cell [m]."""
     gap: NDArray[np.float64]
-    """From a cell's centre to the nearest thing that stands [m]; negative inside."""
+    """From a cell's centre to the nearest thing that stands, or hill [m]; negative inside."""
     to_go: NDArray[np.float64]
     """Time to the goal at 1 m/s [s]."""
 
@@ -72,6 +80,9 @@ def map_of(batch: ArenaBatch, i: int, body: Body) -> Map:
     gap, to_go = np.empty(shape), np.full(shape, FAR)
     first = south + 0.5 * cell, west + 0.5 * cell
     _fill_gaps(batch, i, body, first, cell, gap)
+    most_m = body.altitude - body.half_height - OVER_M
+    if batch.grid[i, TOP] > most_m:
+        gap = np.minimum(gap, _to_hills(batch, i, most_m, first, cell, gap.shape))
     _fill_times(gap, body.radius, first, cell, (batch.goal[i, 0], batch.goal[i, 1]), to_go)
     return Map(first[0], first[1], cell, gap, to_go)
 
@@ -83,7 +94,7 @@ def beside(
     """Return the distance [m] from a place at flight altitude to an obstacle, seen from above."""
     half_size = batch.half_size[i, obstacle]
     center = batch.center[i, obstacle]
-    if abs(-body.altitude - center[2]) > half_size[2] + body.half_height + 0.3:
+    if abs(-body.altitude - center[2]) > half_size[2] + body.half_height + OVER_M:
         return FAR  # above or below
     dx, dy = north - center[0], east - center[1]
     if batch.shape[i, obstacle] != _BOX:
@@ -93,6 +104,46 @@ def beside(
     gx, gy = abs(c * dx + s * dy) - half_size[0], abs(c * dy - s * dx) - half_size[1]
     beside: float = math.sqrt(max(gx, 0.0) ** 2 + max(gy, 0.0) ** 2) + min(0.0, max(gx, gy))
     return beside
+
+
+def _to_hills(
+    batch: ArenaBatch,
+    i: int,
+    most_m: float,
+    first: tuple[float, float],
+    cell: float,
+    shape: tuple[int, int],
+) -> NDArray[np.float64]:
+    """Return the distances (rows, columns) [m] to ground that is higher; negative in it.
+
+    No more than a quarter of a cell too far, and little more than a cell too near: by the exact
+    Euclidean distances between the centres of cells of both kinds.
+    """
+    high = np.empty(shape, np.bool_)
+    _fill_high(batch, i, most_m, first, cell, high)
+    if not high.any():
+        return np.full(shape, FAR)
+    to_high = scipy.ndimage.distance_transform_edt(~high, sampling=cell)
+    to_low = scipy.ndimage.distance_transform_edt(high, sampling=cell)
+    distance: NDArray[np.float64] = to_high - to_low + np.where(high, 0.5, -0.5) * cell
+    return distance
+
+
+@kernel
+def _fill_high(
+    batch: ArenaBatch,
+    i: int,
+    most_m: float,
+    first: tuple[float, float],
+    cell: float,
+    high: NDArray[np.bool_],
+) -> None:
+    """Write in which cells (rows, columns), out to their corners, any ground is higher [m]."""
+    relief, corner = relief_of(batch, i), cell / math.sqrt(2.0)
+    for row in range(high.shape[0]):
+        for column in range(high.shape[1]):
+            north, east = first[0] + row * cell, first[1] + column * cell
+            high[row, column] = extreme_within(relief, north, east, corner, 1.0) > most_m
 
 
 @kernel

@@ -19,6 +19,7 @@ from airl_mav.profiles.appearance import DEFAULT, Appearance
 from airl_mav.profiles.assets import ASSETS, Asset
 from airl_mav.profiles.gates import Gates, check_gates
 from airl_mav.profiles.rooms import HEADROOM_M, Rooms, check_rooms
+from airl_mav.profiles.terrain import Terrain, check_terrain
 
 ShapeName = Literal["box", "cylinder", "sphere"]
 SHAPES: tuple[ShapeName, ...] = get_args(ShapeName)
@@ -77,8 +78,8 @@ class Goal(ProfileModel):
         "free way around the goal, to static obstacles and walls", "m", ge=0.5, le=50, default=2
     )
     height_m: Annotated[tuple[float, float], Each(0.2, 50, ascending=True)] | None = quantity(
-        "height of the goal above the floor, drawn from [least, greatest]; one number: always that;"
-        " left out: it has none, and is reached at any height",
+        "height of the goal above the ground below it, drawn from [least, greatest]; one number:"
+        " always that; left out: it has none, and is reached at any height",
         "m",
         default=None,
     )
@@ -120,7 +121,7 @@ class StaticObstacles(ProfileModel):
         "half width of a box (each way), radius of a cylinder or sphere", "m", default=(0.5, 1.5)
     )
     height_m: Annotated[tuple[float, float], Each(0.2, 50, ascending=True)] = quantity(
-        "height of a box or cylinder; they stand on the floor", "m", default=(3.0, 5.0)
+        "height of a box or cylinder; they stand on the ground", "m", default=(3.0, 5.0)
     )
 
 
@@ -204,6 +205,7 @@ class ArenaSpec(ProfileModel):
     rooms: Rooms = Field(
         default_factory=Rooms, description="walls that divide the arena, with doors between rooms"
     )
+    terrain: Terrain = Field(default_factory=Terrain, description="hills on the floor")
     assets: dict[str, Asset] = Field(
         default_factory=dict, description="things of your own, made of parts, by name"
     )
@@ -232,6 +234,8 @@ class ArenaSpec(ProfileModel):
             silent.append("gates")
         if self.rooms == Rooms():
             silent.append("rooms")
+        if self.terrain == Terrain():
+            silent.append("terrain")
         for name in silent:
             data.pop(name, None)
         if self.goal.height_m is None:
@@ -252,6 +256,7 @@ class ArenaSpec(ProfileModel):
     @model_validator(mode="after")
     def _fits_together(self) -> ArenaSpec:
         self._check_start()
+        self._check_terrain()
         self._check_goal()
         self._check_assets()
         self._check_gates()
@@ -271,12 +276,20 @@ class ArenaSpec(ProfileModel):
                     f"(size.{axis} {length:g}, start.clearance_m {free:g})"
                 )
 
+    @property
+    def _most_m(self) -> tuple[float, str]:
+        """How high what stands on the ground may be [m], and why."""
+        walls = self.size.height_m
+        if not self.terrain.drawn:
+            return walls, "size.height_m, the walls"
+        hills = self.terrain.relief_m[1]
+        return walls - hills, f"size.height_m {walls:g}, the walls, less terrain.relief_m {hills:g}"
+
     def _check_goal(self) -> None:
-        wall, heights = self.size.height_m, self.goal.height_m
-        if heights is not None and heights[1] > wall:
+        heights, (most, why) = self.goal.height_m, self._most_m
+        if heights is not None and heights[1] > most:
             raise ValueError(
-                f"goal.height_m = {list(heights)}: accepted: value <= {wall:g} m (size.height_m,"
-                " the walls)"
+                f"goal.height_m = {list(heights)}: accepted: value <= {most:g} m ({why})"
             )
         if self.goal.fixed is None:
             if self.goal.min_distance_m >= self.zones_m[0]:
@@ -334,6 +347,30 @@ class ArenaSpec(ProfileModel):
                 f"ceiling ({HEADROOM_M:g} m above flight_altitude_m {self.flight_altitude_m:g})"
             )
 
+    def _check_terrain(self) -> None:
+        terrain = self.terrain
+        if not terrain.drawn:
+            return
+        unfit = {
+            "a generator of your own": self.generator != OBSTACLES,
+            "gates": self.gates.count[1] > 0,
+            "rooms": self.rooms.drawn,
+            "a ceiling": self.size.ceiling,
+            "moving obstacles": self.moving.count[1] > 0,
+        }
+        for what, there in unfit.items():
+            if there:
+                raise ValueError(
+                    f"terrain.relief_m = {list(terrain.relief_m)}: accepted: [0, 0] with {what}"
+                )
+        check_terrain(
+            terrain,
+            north_m=self.size.north_m,
+            east_m=self.size.east_m,
+            height_m=self.size.height_m,
+            start_m=(self.start.north_m, self.start.east_m),
+        )
+
     def _check_behind_gates(self) -> None:
         """Refuse gates that leave no room for the goal behind the last of them."""
         last, free = self.gates.last_m, self.goal.clearance_m
@@ -376,22 +413,20 @@ class ArenaSpec(ProfileModel):
                     f"static.shapes.{i} = {name!r}: accepted: "
                     f"{', '.join((*SHAPES, *ASSETS, *self.assets))}"
                 )
-            top, wall = self.asset_scale[1] * known.top_m, self.size.height_m
-            if self.static.count[1] > 0 and top > wall:
+            top, (most, why) = self.asset_scale[1] * known.top_m, self._most_m
+            if self.static.count[1] > 0 and top > most:
                 raise ValueError(
                     f"static.shapes.{i} = {name!r}: reaches up to {top:.3g} m (asset_scale "
-                    f"{list(self.asset_scale)}); accepted: a top <= {wall:g} m (size.height_m, the"
-                    " walls)"
+                    f"{list(self.asset_scale)}); accepted: a top <= {most:g} m ({why})"
                 )
 
     def _check_heights(self, name: str, kind: StaticObstacles) -> None:
-        wall = self.size.height_m
+        wall, (most, why) = self.size.height_m, self._most_m
         if kind.count[1] == 0:
             return
-        if kind.height_m[1] > wall and {"box", "cylinder"} & set(kind.shapes):
+        if kind.height_m[1] > most and {"box", "cylinder"} & set(kind.shapes):
             raise ValueError(
-                f"{name}.height_m = {list(kind.height_m)}: accepted: value <= {wall:g} m "
-                "(size.height_m, the walls)"
+                f"{name}.height_m = {list(kind.height_m)}: accepted: value <= {most:g} m ({why})"
             )
         radius = kind.half_width_m[1]
         top = radius + max(radius, self.flight_altitude_m + SPHERE_OFFSET * radius)

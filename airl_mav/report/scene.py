@@ -53,6 +53,11 @@ ALL_ROUND_DEG = 360.0
 
 STILL_COLOUR = "#8b97a3"
 
+HILLS_COLOUR = "#cbc6b4"
+
+MOST_CELLS = 4_000
+"""Cells of hills on a page, for each flight."""
+
 Floats = NDArray[np.float64]
 Trace = dict[str, Any]
 
@@ -113,6 +118,9 @@ def flight_view(flight: SceneFlight, top: float, fov_deg: float) -> dict[str, An
     record, arena = flight.record, flight.arena
     path = _thinned(flight.path, POINTS)
     place, speed = _east_north_up(path.position), path.speed()
+    ground = None if arena is None else arena.ground
+    below = np.zeros(len(place)) if ground is None else ground.heights_at(path.position)
+    shadow = np.column_stack([place[:, :2], below + 0.05])
     seconds = (path.time_us - record.started_us) / US_PER_S
     moving: dict[str, Any] | None = None
     traces = [] if arena is None else _arena_traces(arena)
@@ -135,11 +143,13 @@ def flight_view(flight: SceneFlight, top: float, fov_deg: float) -> dict[str, An
             ],
         }
     east, north = record.goal[1], record.goal[0]
-    up = goal_height_m(record.goal) or 0.1
+    base = 0.0 if ground is None else ground.height_at(north, east)
+    up = goal_height_m(record.goal) or base + 0.1
+    ring = _ring(east, north, record.goal_radius_m) + np.array([0.0, 0.0, base])
     speed_bar = {"title": {"text": "m/s"}, "thickness": 12, "len": 0.5, "x": 1.0}
     scale = [[i / 15.0, _hex(speed_colours()(i / 15.0))] for i in range(16)]
     traces += [
-        _line(place * [1.0, 1.0, 0.0] + [0.0, 0.0, 0.05], "#8d969f", "shadow", width=2),
+        _line(shadow, "#8d969f", "shadow", width=2),
         {
             **_line(place, "", "path", width=7),
             "line": {
@@ -154,7 +164,7 @@ def flight_view(flight: SceneFlight, top: float, fov_deg: float) -> dict[str, An
             "customdata": _rounded(np.stack([seconds, speed], axis=1)),
             "hovertemplate": "%{customdata[0]:.1f} s, %{customdata[1]:.1f} m/s<extra></extra>",
         },
-        _line(_ring(east, north, record.goal_radius_m), GOAL_COLOUR, "goal", width=4),
+        _line(ring, GOAL_COLOUR, "goal", width=4),
         _marks(np.array([[east, north, up]]), GOAL_COLOUR, "goal", symbol="diamond"),
         _marks(np.zeros((1, 3)), START_COLOUR, "start", symbol="square"),
         _marks(
@@ -293,6 +303,10 @@ def _arena_traces(arena: Arena, *, obstacles: bool = True) -> list[Trace]:
         _mesh([(floor, np.array([(0, 1, 2), (0, 2, 3)]))], "#c9cdd2", "floor", opacity=0.45),
         _mesh([(walls, np.array(faces))], f"rgb({red},{green},{blue})", "wall", opacity=0.12),
     ]
+    if arena.ground is not None and obstacles:
+        hills = arena.ground.coarser(MOST_CELLS)
+        body = (_east_north_up(hills.points), hills.faces.astype(np.int64))
+        traces.append(_mesh([body], HILLS_COLOUR, "ground"))
     if obstacles and arena.n_static:
         shown = drawn(arena.meshes, MOST_TRIANGLES)
         still = [

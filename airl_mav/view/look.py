@@ -11,6 +11,7 @@ Colour = tuple[int, int, int]
 
 STILL, MOVING, GOAL, START = (139, 151, 163), (240, 147, 43), (27, 138, 63), (31, 78, 140)
 FLOOR, GRID, SECTION = (236, 238, 240), (214, 218, 222), (186, 192, 198)
+HILLS = (203, 198, 180)
 FLOWN, COMMANDED, DROP = (40, 104, 168), (214, 84, 10), (120, 128, 136)
 NOSE, BLADE = (214, 84, 10), (33, 38, 45)
 

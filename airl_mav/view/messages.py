@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from airl_mav.arena.appearance import Statics
 from airl_mav.arena.geometry import Arena, Bounds, Building, Obstacles, PlacedMesh, Tour
+from airl_mav.arena.ground import Ground
 from airl_mav.core.goals import Goal
 from airl_mav.profiles.appearance import DEFAULT, Appearance
 from airl_mav.profiles.mesh_file import MeshFile
@@ -64,6 +65,7 @@ class MeshShown(Message):
     scale: float
     first: int
     count: int
+    base_m: float = 0.0
 
     @classmethod
     def of(cls, placed: PlacedMesh) -> MeshShown:
@@ -72,7 +74,37 @@ class MeshShown(Message):
 
     def placed(self) -> PlacedMesh:
         """Return the mesh."""
-        return PlacedMesh(self.file, self.place, self.yaw, self.scale, self.first, self.count)
+        return PlacedMesh(
+            self.file, self.place, self.yaw, self.scale, self.first, self.count, self.base_m
+        )
+
+
+class GroundShown(Message):
+    """Hills, as `arena.ground.Ground`."""
+
+    heights: tuple[tuple[float, ...], ...]
+    south: float
+    west: float
+    step_north: float
+    step_east: float
+
+    @classmethod
+    def of(cls, ground: Ground | None) -> GroundShown | None:
+        """Return hills as plain numbers; None: there are none."""
+        if ground is None:
+            return None
+        return cls(
+            heights=_rows(ground.heights),
+            south=ground.south,
+            west=ground.west,
+            step_north=ground.step_north,
+            step_east=ground.step_east,
+        )
+
+    def ground(self) -> Ground:
+        """Return the hills."""
+        heights = np.array(self.heights, np.float64)
+        return Ground(heights, self.south, self.west, self.step_north, self.step_east)
 
 
 class ArenaShown(Message):
@@ -95,6 +127,7 @@ class ArenaShown(Message):
     n_gates: int = 0
     ceiling: bool = False
     building: Building | None = None
+    ground: GroundShown | None = None
 
     @classmethod
     def of(cls, arena: Arena) -> ArenaShown:
@@ -126,6 +159,7 @@ class ArenaShown(Message):
             n_gates=arena.n_gates,
             ceiling=arena.bounds.ceiling,
             building=arena.building,
+            ground=GroundShown.of(arena.ground),
         )
 
     def arena(self) -> Arena:
@@ -152,6 +186,7 @@ class ArenaShown(Message):
             goal_height_m=self.goal_height_m,
             n_gates=self.n_gates,
             building=self.building,
+            ground=None if self.ground is None else self.ground.ground(),
         )
 
 

@@ -7,6 +7,7 @@ frame FRD.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -35,6 +36,7 @@ from airl_mav.view.look import (
     FLOWN,
     GOAL,
     GRID,
+    HILLS,
     LEAST_ARROW_M,
     MOVING,
     NOSE,
@@ -131,7 +133,7 @@ class FlightScene:
         if self._look.whole:
             bounds = OPEN if arena is None else arena.bounds
             self._build_floor(bounds)
-            self._build_ends(episode, 0.6 * bounds.height)
+            self._build_ends(episode, 0.6 * bounds.height, _below(arena, episode.goal))
             if arena is not None:
                 self._build_arena(arena)
         self._build_vehicle(episode.vehicle)
@@ -175,6 +177,16 @@ class FlightScene:
             side="front",
             flat_shading=True,
         )
+        if arena.ground is not None:
+            self._add(
+                "mesh_simple",
+                "/arena/ground",
+                arena.ground.points.astype(np.float32),
+                arena.ground.faces.astype(np.uint32),
+                color=HILLS,
+                side="double",
+                flat_shading=True,
+            )
         shown = drawn(arena.meshes)
         for each in shown:
             places, triangles = standing(each)
@@ -195,11 +207,11 @@ class FlightScene:
             if moves:
                 self._movers.append(node)
 
-    def _build_ends(self, episode: Episode, height: float) -> None:
-        """Build start and goal, with a pole of a height [m]."""
+    def _build_ends(self, episode: Episode, height: float, base: float) -> None:
+        """Build start and goal, with a pole of a height [m] on ground of a height [m]."""
         goal = episode.goal[:2]
         if (height_m := goal_height_m(episode.goal)) is not None:
-            height = height_m
+            height = height_m - base
             self._add(
                 "icosphere",
                 "/goal/ball",
@@ -215,7 +227,7 @@ class FlightScene:
             height=0.04,
             color=GOAL,
             opacity=0.45,
-            position=(*goal, -0.03),
+            position=(*goal, -base - 0.03),
         )
         self._add(
             "cylinder",
@@ -223,9 +235,9 @@ class FlightScene:
             radius=0.04,
             height=height,
             color=GOAL,
-            position=(*goal, -0.5 * height),
+            position=(*goal, -base - 0.5 * height),
         )
-        self._add("label", "/goal/label", "goal", position=(*goal, -height - 0.2))
+        self._add("label", "/goal/label", "goal", position=(*goal, -base - height - 0.2))
         self._add(
             "cylinder",
             "/start",
@@ -331,7 +343,8 @@ class FlightScene:
             centers = shown.arena.centers_at(vehicle.time_us - episode.started_us)
             for node, center in zip(self._movers, centers[shown.arena.n_static :], strict=True):
                 node.position = center
-        self._drop.points = np.array([[[0.0, 0.0, 0.0], [0.0, 0.0, -at[2]]]], np.float32)
+        above = -at[2] - _below(shown.arena, vehicle.position)
+        self._drop.points = np.array([[[0.0, 0.0, 0.0], [0.0, 0.0, above]]], np.float32)
         self._flown.points = arrow(np.array(vehicle.velocity))
         command = shown.command if self._look.whole else None
         if command is not None:
@@ -353,6 +366,13 @@ class FlightScene:
                 )
             else:
                 self._trail[part].points = segments
+
+
+def _below(arena: Arena | None, place: Sequence[float]) -> float:
+    """Return how high the ground is at a place (>= 2,) NED [m]."""
+    if arena is None or arena.ground is None:
+        return 0.0
+    return arena.ground.height_at(place[0], place[1])
 
 
 def walls(bounds: Bounds) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena, Shape
+from airl_mav.arena.ground import Relief, no_relief
 from airl_mav.core.frames import Vector
 from airl_mav.core.kernels import kernel
 from airl_mav.profiles.vehicle import Body as BodyProfile
@@ -20,6 +21,7 @@ from firmware_sim.plant.body import FLOOR, NOTHING, Touch, walls_of
 from firmware_sim.plant.contacts.box import BREAKING_SHARE, MOST, ROW
 from firmware_sim.plant.contacts.convex import touch_obstacle
 from firmware_sim.plant.contacts.floor import FLOOR_ID, KEPT, touch_floor
+from firmware_sim.plant.contacts.ground import near_ground, touch_ground
 from firmware_sim.plant.contacts.solver import resolve
 from firmware_sim.plant.kinematics import WIDTH, quaternion, rates, velocity, write
 from firmware_sim.plant.tours import place_at, tour_arrays
@@ -29,7 +31,7 @@ _FIRST = FLOOR_ID + 1
 
 
 class Solids(NamedTuple):
-    """Walls and obstacles of an arena, n of them; the last m move."""
+    """Walls and obstacles of an arena, n of them, of which the last m move; and its ground."""
 
     shape: NDArray[np.int8]  # (n,)
     center: Vector  # (n, 3) NED [m]; of those that move it is updated
@@ -38,6 +40,7 @@ class Solids(NamedTuple):
     times_s: Vector  # (m, 1 + k) as `tour_arrays`
     points: Vector  # (m, k, 2)
     leg: NDArray[np.int64]  # (m,)
+    relief: Relief
 
 
 class State(NamedTuple):
@@ -51,7 +54,7 @@ class State(NamedTuple):
 
 
 def solids_of(arena: Arena | None) -> tuple[Solids, list[str]]:
-    """Return the walls and obstacles of an arena, and their names; None has none."""
+    """Return the walls, obstacles and ground of an arena, and their names; None has none."""
     if arena is None:
         return (
             Solids(
@@ -62,6 +65,7 @@ def solids_of(arena: Arena | None) -> tuple[Solids, list[str]]:
                 np.full((0, 2), np.inf),
                 np.zeros((0, 1, 2)),
                 np.zeros(0, np.int64),
+                no_relief(),
             ),
             [],
         )
@@ -75,6 +79,7 @@ def solids_of(arena: Arena | None) -> tuple[Solids, list[str]]:
         times,
         points,
         np.zeros(len(arena.tours), np.int64),
+        no_relief() if arena.ground is None else arena.ground.relief,
     )
     return solids, [name for name, _, _ in walls] + [arena.name_of(i) for i in range(len(o))]
 
@@ -120,6 +125,8 @@ def _find_contacts(
     count = 0
     if state.many[0] > 0 or -p[2] - radius < close:
         count = touch_floor(p, q, half, close, state.kept, state.many, state.rows, 0)
+    if near_ground(solids.relief, p, radius, close):
+        count = touch_ground(p, q, half, close, solids.relief, state.rows, count)
     if state.room[0] > close:
         return count
     n, moving = len(solids.shape), len(solids.leg)

@@ -30,7 +30,7 @@ _ENDLESS = Bounds(-1e6, 1e6, -1e6, 1e6, 1.0)
 
 
 class PlantRangefinder:
-    """Measures the distance to floor, walls and obstacles, moving ones and meshes among them."""
+    """Measures the distance to ground, walls and obstacles, moving ones and meshes among them."""
 
     def __init__(
         self, profile: Rangefinder, arena: Arena | None, rng: np.random.Generator, times: float
@@ -60,7 +60,7 @@ class PlantRangefinder:
             bodies = arena.obstacles
             self._shapes = bodies.shape, bodies.half_size, bodies.yaw
             self._still = bodies.center
-            self._meshes = meshes_of(arena.meshes, len(bodies))
+            self._meshes = meshes_of(arena.meshes, len(bodies), arena.ground)
         # The first ray loads or compiles the kernels: better here than in flight.
         self.range_m(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), 0)
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from airl_mav.arena.geometry import Arena, Shape
+from airl_mav.arena.ground import Ground
 from airl_mav.core.constants import GRAVITY_M_S2, TICK_S
 from airl_mav.core.frames import (
     Vector,
@@ -27,9 +28,12 @@ def facing(yaw: float) -> Xyzw:
 
 LEVEL = facing(0.0)
 
+UNTURNED: Xyzw = (0.0, 0.0, 0.0, 1.0)
+"""That of a body whose shape is given in ENU."""
+
 
 class World:
-    """A pybullet world: floor, walls, obstacles. ENU inside, NED outside."""
+    """A pybullet world: floor, hills, walls, obstacles. ENU inside, NED outside."""
 
     def __init__(
         self, arena: Arena | None, vehicle_radius_m: float, tick_s: float = TICK_S
@@ -50,6 +54,8 @@ class World:
         floor = self.client.createCollisionShape(pybullet.GEOM_PLANE)
         self._add(floor, np.zeros(3), LEVEL, FLOOR)
         if arena is not None:
+            if arena.ground is not None:
+                self._add_ground(arena.ground)
             self._add_walls(arena)
             bodies, attitudes = self._add_obstacles(arena)
             if arena.tours:
@@ -83,6 +89,17 @@ class World:
         self.client.changeDynamics(body, -1, activationState=pybullet.ACTIVATION_STATE_SLEEP)
         self.names[body] = name
         return int(body)
+
+    def _add_ground(self, ground: Ground) -> None:
+        shape = self.client.createCollisionShape(
+            pybullet.GEOM_MESH,
+            vertices=ned_to_enu(ground.points).tolist(),
+            indices=ground.faces.ravel().tolist(),
+            flags=pybullet.GEOM_FORCE_CONCAVE_TRIMESH,
+        )
+        body = self._add(shape, np.zeros(3), UNTURNED, FLOOR)
+        # Without it everything stands a millimetre above the triangles.
+        self.client.changeDynamics(body, -1, collisionMargin=0.0)
 
     def _box(self, half: tuple[float, float, float]) -> int:
         return int(self.client.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half))

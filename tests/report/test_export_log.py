@@ -16,6 +16,7 @@ import pytest
 from pyulog import ULog
 from scipy.spatial.transform import Rotation, Slerp
 
+from airl_mav.arena.generate import generate
 from airl_mav.black_box.messages import Decision, End, Latency, Phase, Telemetry
 from airl_mav.black_box.reading import read_black_box
 from airl_mav.black_box.writing import BlackBoxFile
@@ -24,6 +25,8 @@ from airl_mav.core.clock import SimClock
 from airl_mav.core.errors import UsageError
 from airl_mav.flight.judge import Outcome
 from airl_mav.latency.stamps import STAMPS
+from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.profiles.loading import load_profile
 from airl_mav.rehearsal.run_folder import LoadedRun, load
 from airl_mav.report.export_log.files import flight_of
 from airl_mav.report.export_log.recorded import RecordedFlight
@@ -33,7 +36,7 @@ from airl_mav.report.replay.runs import ReplayedRun
 from tests.support.command_line import airl, option_words
 from tests.support.flown_here import flown_here
 from tests.support.lenses import angles
-from tests.support.mcap_kit import ReadMcap, distances_to, read_mcap, turn_of, xyz
+from tests.support.mcap_kit import ReadMcap, distances_to, protobuf_kind, read_mcap, turn_of, xyz
 
 ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 FLU_FROM_FRD = np.diag([1.0, -1.0, -1.0])
@@ -186,6 +189,32 @@ def test_what_the_camera_saw_lies_on_the_bodies_of_the_scene(
         seen += len(z)
     assert seen > 1000
     assert bool(moving) == bool(len(movers_ns))
+
+
+def test_hills_are_in_the_scene_and_the_goal_stands_on_them() -> None:
+    pytest.importorskip("foxglove")
+    from foxglove.messages import Timestamp
+
+    from airl_mav.report.export_log.scene import arena_scene
+
+    spec = load_profile("arenas", "hills", ArenaSpec)
+    arenas = (generate(spec, seed, name="hills", vehicle_width_m=0.6) for seed in range(30))
+    # One whose goal is on a hill.
+    arena = next(each for each in arenas if each.ground and each.ground.height_at(*each.goal) > 0.3)
+    ground = arena.ground
+    assert ground is not None
+    told = arena_scene(arena, arena.goal_point, 3.0, Timestamp(0, 0))
+    schema = told.get_schema()
+    scene = protobuf_kind(schema.name, schema.data).FromString(told.encode())
+    entities = {entity.id: entity for entity in scene.entities}
+    (surface,) = entities["ground"].triangles
+    places = np.array([[point.x, point.y, point.z] for point in surface.points])
+    np.testing.assert_allclose(places, ground.points @ ENU_FROM_NED.T, atol=1e-9)
+    np.testing.assert_array_equal(np.reshape(surface.indices, (-1, 3)), ground.faces)
+    disc, pole, _ = entities["goal"].cylinders
+    below = ground.height_at(*arena.goal.tolist())
+    assert disc.pose.position.z == pytest.approx(below + 0.02)
+    assert pole.pose.position.z - 0.5 * pole.size.z == pytest.approx(below)
 
 
 def test_arrows_and_the_path_are_those_of_the_recording(flown: LoadedRun, told: ReadMcap) -> None:

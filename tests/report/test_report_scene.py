@@ -11,8 +11,12 @@ import numpy as np
 import plotly.graph_objects as go
 import pytest
 
+from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena, Shape
+from airl_mav.arena.ground import Ground
 from airl_mav.flight.judge import Outcome
+from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.profiles.loading import load_profile
 from airl_mav.rehearsal.run_folder import LoadedRun, load
 from airl_mav.report import scene
 from airl_mav.report.run_figures import coloured_pieces
@@ -131,6 +135,37 @@ def test_the_view_has_the_triangles_of_meshes(demo: Demo, tmp_path: Path) -> Non
     drawn = np.stack([body["x"], body["y"], body["z"]], axis=1)
     np.testing.assert_allclose(drawn, places[:, [1, 0, 2]] * [1.0, 1.0, -1.0], atol=0.006)
     np.testing.assert_array_equal(np.stack([body[axis] for axis in "ijk"], axis=1), faces)
+
+
+def test_the_view_has_hills_and_what_lies_on_them(demo: Demo) -> None:
+    spec = load_profile("arenas", "hills", ArenaSpec)
+    arena = generate(spec, 3, name="hills", vehicle_width_m=0.6)
+    ground = arena.ground
+    assert ground is not None
+    run, _ = demo
+    flight = SceneFlight(run.episodes[0], run.trajectories[0], arena)
+    view = flight_view(flight, 5.0, 90.0)
+    body = trace(view, "ground")
+    drawn = np.stack([body["x"], body["y"], body["z"]], axis=1)
+    np.testing.assert_allclose(drawn, ground.points[:, [1, 0, 2]] * [1.0, 1.0, -1.0], atol=0.006)
+    np.testing.assert_array_equal(np.stack([body[axis] for axis in "ijk"], axis=1), ground.faces)
+    shadow = trace(view, "shadow")
+    for east, north, up in zip(shadow["x"], shadow["y"], shadow["z"], strict=True):
+        assert up == pytest.approx(ground.height_at(north, east) + 0.05, abs=0.02)
+
+
+def test_hills_of_many_cells_are_drawn_with_fewer() -> None:
+    rng = np.random.default_rng(0)
+    north, east = np.arange(101), np.arange(121)
+    heights = 2.0 + np.sin(north[:, None] / 15.0) + np.cos(east / 20.0) + 0.0 * rng.random()
+    fine = Ground(heights, -10.0, -20.0, 0.5, 0.4)
+    coarse = fine.coarser(3000)
+    assert (np.array(coarse.heights.shape) - 1).prod() <= 3000
+    assert fine.coarser(12_000) is fine
+    np.testing.assert_allclose(coarse.points[0], fine.points[0])
+    np.testing.assert_allclose(coarse.points[-1], fine.points[-1])
+    for place in rng.uniform([-10.0, -20.0], [40.0, 28.0], (100, 2)):
+        assert coarse.height_at(*place) == pytest.approx(fine.height_at(*place), abs=0.02)
 
 
 def test_the_slider_moves_obstacles_along_their_tours(demo: Demo) -> None:

@@ -250,6 +250,21 @@ def test_the_same_seed_draws_the_same_bent_image() -> None:
     assert shown[~blind].any(axis=-1).mean() > 0.99
 
 
+@pytest.mark.timeout(600)  # compiles kernels, on a busy machine for minutes
+@pytest.mark.parametrize("material", ["earth", "grass"])
+def test_hills_are_theirs(material: str) -> None:
+    """Triangles above the floor in its material, whose pattern goes on over them."""
+    scene = arena("hills", 3, **{**LIGHT, **PLAIN, "floor": {"materials": [material]}})
+    inner, _ = difference(scene, (-2.0, 0.0, -4.0), 0.2, rays=4)
+    assert inner < 0.03
+    # A flat floor is far off: the limit above can fail.
+    place, attitude = np.array([-2.0, 0.0, -4.0]), quat_from_euler(0.03, -0.08, 0.2)
+    centers, flat = scene.obstacles.center, replace(scene, ground=None)
+    theirs = path_traced(scene, centers, CAMERA, place, attitude, samples=16)
+    ours = antialiased(flat, centers, CAMERA, place, attitude, 4)
+    assert float(np.abs(ours.astype(float) - theirs).mean()) / 255.0 > 0.02
+
+
 def test_what_it_has_not_is_refused() -> None:
     fog = arena("no-obstacles", 0, fog={"extinction_1_m": [0.1, 0.1]})
     place, level = np.array([0.0, 0.0, -2.5]), quat_from_euler(0, 0, 0)

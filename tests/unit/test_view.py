@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape, Tour
 from airl_mav.cli.evaluate import EvaluateOptions
 from airl_mav.cli.evaluate import run as evaluate
@@ -24,6 +25,8 @@ from airl_mav.cli.viewing import view_of
 from airl_mav.core.clock import SimClock
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.latency.samplers import FixedSampler
+from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
@@ -528,6 +531,37 @@ def test_meshes_are_told_by_their_file(tmp_path: Path) -> None:
     assert isinstance(read[0], Episode)
     assert read[0].arena is not None
     assert read[0].arena.arena().meshes == arena.meshes
+
+
+def test_hills_are_told_and_shown_as_they_are() -> None:
+    viser = pytest.importorskip("viser")
+    from airl_mav.view.scene import FlightScene
+
+    spec = load_profile("arenas", "hills", ArenaSpec)
+    arena = generate(spec, 3, name="hills", vehicle_width_m=0.6)
+    assert arena.ground is not None
+    read = from_parts(to_parts(episode(arena)))
+    assert read is not None
+    assert isinstance(read[0], Episode)
+    assert read[0].arena is not None
+    told = read[0].arena.arena().ground
+    assert told is not None
+    np.testing.assert_array_equal(told.heights, arena.ground.heights)
+    np.testing.assert_array_equal(told.relief.grid, arena.ground.relief.grid)
+    server = viser.ViserServer("127.0.0.1", 0, verbose=False)
+    try:
+        scene, shown = FlightScene(server), Shown()
+        shown.take(episode(arena), None)
+        shown.take(vehicle(0.0), None)
+        scene.draw(shown, picture=False)
+        drawn = server.scene.get_handle_by_name("/flight/arena/ground")
+        np.testing.assert_allclose(drawn.vertices, arena.ground.points, atol=1e-5)
+        np.testing.assert_array_equal(drawn.faces, arena.ground.faces)
+        goal = server.scene.get_handle_by_name("/flight/goal/disc").position
+        below = arena.ground.height_at(goal[0], goal[1])
+        assert goal[2] == pytest.approx(-below - 0.03)
+    finally:
+        server.stop()
 
 
 def test_walls_are_seen_from_inside() -> None:

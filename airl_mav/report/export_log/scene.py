@@ -25,6 +25,7 @@ from foxglove.messages import (
     TriangleListPrimitive,
     Vector3,
 )
+from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena, Bounds, PlacedMesh, Shape
 from airl_mav.arena.triangles import drawn, standing
@@ -49,6 +50,7 @@ from airl_mav.view.look import (
     FLOOR,
     FLOWN,
     GOAL,
+    HILLS,
     LEAST_ARROW_M,
     MOVING,
     NOSE,
@@ -70,12 +72,17 @@ Size = tuple[float, float, float]
 def arena_scene(
     arena: Arena | None, goal: Goal, goal_radius_m: float, at: Timestamp
 ) -> SceneUpdate:
-    """Return what stands still: floor, walls, obstacles, goal and start."""
+    """Return what stands still: floor, hills, walls, obstacles, goal and start."""
     bounds = OPEN if arena is None else arena.bounds
+    ground = None if arena is None else arena.ground
+    base_m = 0.0 if ground is None else ground.height_at(goal[0], goal[1])
+    top_m = goal_height_m(goal) or base_m + 0.6 * bounds.height
     entities = [
         SceneEntity(timestamp=at, frame_id=WORLD, id="floor", cubes=[_floor(bounds)]),
-        _ends(goal, goal_radius_m, goal_height_m(goal) or 0.6 * bounds.height, at),
+        _ends(goal, goal_radius_m, (base_m, top_m), at),
     ]
+    if ground is not None:
+        entities.append(_surface("ground", ground.points, ground.faces, HILLS, at))
     if arena is not None:
         walls = SceneEntity(
             timestamp=at, frame_id=WORLD, id="walls", cubes=_walls(bounds, arena.wall_colour)
@@ -181,14 +188,19 @@ def obstacle(
 
 def _mesh(placed: PlacedMesh, at: Timestamp) -> SceneEntity:
     """Return a mesh where it stands."""
-    places, faces = standing(placed)
+    return _surface(f"mesh/{placed.first}", *standing(placed), STILL, at)
+
+
+def _surface(
+    name: str, places: Floats, faces: NDArray[np.int32], rgb: Colour, at: Timestamp
+) -> SceneEntity:
+    """Return triangles (m, 3) of places (n, 3) NED [m]."""
     surface = TriangleListPrimitive(
         pose=Pose(position=vector(np.zeros(3)), orientation=quaternion(UNTURNED)),
         points=points(places),
-        color=colour(STILL),
+        color=colour(rgb),
         indices=faces.ravel().tolist(),
     )
-    name = f"mesh/{placed.first}"
     return SceneEntity(timestamp=at, frame_id=WORLD, id=name, triangles=[surface])
 
 
@@ -213,16 +225,16 @@ def _walls(b: Bounds, rgb: Colour) -> list[CubePrimitive]:
     ]
 
 
-def _ends(goal: Goal, radius_m: float, height_m: float, at: Timestamp) -> SceneEntity:
-    """Return the goal with its pole and name, and the start."""
+def _ends(goal: Goal, radius_m: float, pole_m: tuple[float, float], at: Timestamp) -> SceneEntity:
+    """Return the goal with its name and its pole, from a height to another, and the start."""
 
-    def disc(north: float, east: float, radius: float, rgb: Colour) -> CylinderPrimitive:
-        return _cylinder(np.array([north, east, -THIN_M]), radius, THIN_M, rgb, 0.45)
+    def disc(place: tuple[float, float, float], radius: float, rgb: Colour) -> CylinderPrimitive:
+        return _cylinder(np.array(place) - [0.0, 0.0, THIN_M], radius, THIN_M, rgb, 0.45)
 
-    north, east = goal[:2]
-    pole = _cylinder(np.array([north, east, -0.5 * height_m]), 0.04, height_m, GOAL)
+    (north, east), (base, top) = goal[:2], pole_m
+    pole = _cylinder(np.array([north, east, -0.5 * (base + top)]), 0.04, top - base, GOAL)
     name = TextPrimitive(
-        pose=pose(np.array([north, east, -height_m - 0.4])),
+        pose=pose(np.array([north, east, -top - 0.4])),
         billboard=True,
         font_size=0.6,
         color=colour(GOAL),
@@ -232,7 +244,11 @@ def _ends(goal: Goal, radius_m: float, height_m: float, at: Timestamp) -> SceneE
         timestamp=at,
         frame_id=WORLD,
         id="goal",
-        cylinders=[disc(north, east, radius_m, GOAL), pole, disc(0.0, 0.0, 0.4, START)],
+        cylinders=[
+            disc((north, east, -base), radius_m, GOAL),
+            pole,
+            disc((0.0, 0.0, 0.0), 0.4, START),
+        ],
         texts=[name],
     )
 

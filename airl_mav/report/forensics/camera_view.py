@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena, Obstacles, PlacedMesh, Shape
+from airl_mav.arena.ground import Ground
 from airl_mav.camera.colour import RANGE_M
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import Mount, camera_pose, render
@@ -144,14 +145,17 @@ def view_obstacle(
     offset = spot + (centers[i] - centers_then[i])[:2] - position[:2]
     eye, attitude = camera_pose(position, quaternion, camera.mount)
 
-    def depth(keep: slice, meshes: tuple[PlacedMesh, ...]) -> NDArray[np.float32]:
+    def depth(
+        keep: slice, meshes: tuple[PlacedMesh, ...], ground: Ground | None = None
+    ) -> NDArray[np.float32]:
         """Return the depth image (h, w) of the arena with some of its obstacles only."""
         o = arena.obstacles
         some = Obstacles(o.shape[keep], o.center[keep], o.half_size[keep], o.yaw[keep])
-        bare = replace(arena, obstacles=some, tours=(), meshes=meshes)
+        bare = replace(arena, obstacles=some, tours=(), meshes=meshes, ground=ground)
         return render(bare, centers[keep], camera.intrinsics, camera.range_m, eye, attitude)
 
-    whole, empty = depth(slice(None), arena.meshes), depth(slice(0, 0), ())
+    whole = depth(slice(None), arena.meshes, arena.ground)
+    empty = depth(slice(0, 0), ())
     if (mesh := arena.mesh_of(i)) is None:
         alone = depth(slice(i, i + 1), ())
     else:

@@ -1,0 +1,185 @@
+"""Contacts of the vehicle's box with hills: triangles above the floor.
+
+The box's corners touch the triangle below them, the ground's points the face of the box that they
+are in, and where an edge of the box crosses a ridge of the ground from above, the two touch along
+what is square to both. A triangle that lies on the floor is the floor's (`contacts.floor`).
+"""
+
+from __future__ import annotations
+
+import math
+
+from airl_mav.arena.ground import COLUMNS, ROWS, TOP, Relief, extreme_within, plane_at
+from airl_mav.core.frames import Vector
+from airl_mav.core.kernels import kernel, large_kernel
+from airl_mav.vehicle.rotation import Quat, Vec, conjugate, rotate
+from firmware_sim.plant.contacts.box import corner_of, note
+from firmware_sim.plant.contacts.floor import FLOOR_ID
+
+_BESIDE_M = 1e-3
+"""How far from an edge of the ground it is looked whether it is a ridge [m]."""
+
+_RIDGE = 1e-5
+"""A ridge is at least so much higher than what is beside it, on average, as a share of that way."""
+
+_PARALLEL = 1e-3
+"""Edges of length 1 whose product is shorter touch with their ends: those are corners or points."""
+
+
+@kernel
+def near_ground(relief: Relief, p: Vec, radius: float, close: float) -> bool:
+    """Return whether a sphere around the vehicle may be close to hills."""
+    if len(relief.heights) == 0 or -p[2] - radius - close > relief.grid[TOP]:
+        return False
+    return bool(-p[2] - radius < extreme_within(relief, p[0], p[1], radius + close, 1.0) + close)
+
+
+@large_kernel
+def touch_ground(
+    p: Vec, q: Quat, half: Vector, close: float, relief: Relief, rows: Vector, count: int
+) -> int:
+    """Find the contacts with hills.
+
+    Args:
+        p: Of the vehicle's centre, NED [m].
+        q: Attitude body -> NED.
+        half: (3,) half extents of its box [m].
+        close: Points further off are none [m].
+        relief: The ground.
+        rows: (MOST, ROW) contacts; written from `count` on.
+        count: How many there are already.
+
+    Returns:
+        How many there are now.
+    """
+    for k in range(8):
+        arm = rotate(q, corner_of(k, half))
+        height, up, across = plane_at(relief, p[0] + arm[0], p[1] + arm[1])
+        if height == 0.0 and up == 0.0 and across == 0.0:
+            continue
+        per = 1.0 / math.sqrt(1.0 + up * up + across * across)
+        apart = per * (-(p[2] + arm[2]) - height)
+        if apart < close:
+            normal = (-per * up, -per * across, -per)
+            count = note(rows, count, arm, normal, apart, FLOOR_ID)
+    count = _touch_points(p, q, half, close, relief, rows, count)
+    for k in range(8):
+        for axis in range(3):
+            other = k ^ (1 << axis)
+            if k < other:
+                a, b = rotate(q, corner_of(k, half)), rotate(q, corner_of(other, half))
+                for family in range(3):
+                    count = _touch_ridges(p, a, b, family, close, relief, rows, count)
+    return count
+
+
+@kernel
+def _touch_points(
+    p: Vec, q: Quat, half: Vector, close: float, relief: Relief, rows: Vector, count: int
+) -> int:
+    """Find the points of the ground that are in the box, or just outside of a face.
+
+    Of the faces that look down the one through which the way out is shortest touches it.
+    """
+    heights, grid = relief.heights, relief.grid
+    n_rows, n_columns = int(grid[ROWS]), int(grid[COLUMNS])
+    radius = math.sqrt(half[0] ** 2 + half[1] ** 2 + half[2] ** 2)
+    x, y = p[0] - grid[0], p[1] - grid[1]
+    back = conjugate(q)
+    down = rotate(back, (0.0, 0.0, 1.0))
+    first_row = max(math.ceil((x - radius) / grid[2]), 0)
+    last_row = min(math.floor((x + radius) / grid[2]), n_rows - 1)
+    first_column = max(math.ceil((y - radius) / grid[3]), 0)
+    last_column = min(math.floor((y + radius) / grid[3]), n_columns - 1)
+    for i in range(first_row, last_row + 1):
+        for j in range(first_column, last_column + 1):
+            height = heights[i * n_columns + j]
+            if height == 0.0:
+                continue
+            arm = (i * grid[2] - x, j * grid[3] - y, -height - p[2])
+            b = rotate(back, arm)
+            best, face = math.inf, -1
+            for axis in range(3):
+                side = 1.0 if down[axis] >= 0.0 else -1.0
+                depth = half[axis] - side * b[axis]
+                if side * b[axis] < -half[axis]:
+                    best, face = math.inf, -1
+                    break
+                # Of two it is the face that looks down more.
+                if abs(down[axis]) > 0.5 and depth < best:
+                    best, face = depth, axis
+            if face < 0 or best < -close:
+                continue
+            inside = True
+            for axis in range(3):
+                if axis != face and abs(b[axis]) > half[axis]:
+                    inside = False
+            if inside:
+                side = -1.0 if down[face] >= 0.0 else 1.0
+                out = (
+                    side if face == 0 else 0.0,
+                    side if face == 1 else 0.0,
+                    side if face == 2 else 0.0,
+                )
+                count = note(rows, count, arm, rotate(q, out), -best, FLOOR_ID)
+    return count
+
+
+@kernel
+def _touch_ridges(
+    p: Vec, a: Vec, b: Vec, family: int, close: float, relief: Relief, rows: Vector, count: int
+) -> int:
+    """Find where an edge of the box crosses ridges of the ground.
+
+    Args:
+        p: Of the vehicle's centre, NED [m].
+        a: One end of the edge, from there [m].
+        b: The other end.
+        family: Which edges of the ground: 0 from west to east, 1 from south to north, 2 diagonals.
+        close: As of `touch_ground`, with the rest.
+        relief: The ground.
+        rows: Contacts.
+        count: How many there are already.
+    """
+    grid = relief.grid
+    d = (b[0] - a[0], b[1] - a[1], b[2] - a[2])
+    # In cells; edges are where a whole number is.
+    x, y = (p[0] + a[0] - grid[0]) / grid[2], (p[1] + a[1] - grid[1]) / grid[3]
+    dx, dy = d[0] / grid[2], d[1] / grid[3]
+    at, step = x - y, dx - dy
+    beside, along = (grid[2], -grid[3]), (grid[2], grid[3])
+    if family == 0:
+        at, step, beside, along = x, dx, (grid[2], 0.0), (0.0, grid[3])
+    elif family == 1:
+        at, step, beside, along = y, dy, (0.0, grid[3]), (grid[2], 0.0)
+    if abs(step) < 1e-12:
+        return count
+    for line in range(math.ceil(min(at, at + step)), math.floor(max(at, at + step)) + 1):
+        share = (line - at) / step
+        arm = (a[0] + share * d[0], a[1] + share * d[1], a[2] + share * d[2])
+        n, e = p[0] + arm[0], p[1] + arm[1]
+        height = plane_at(relief, n, e)[0]
+        gap = -(p[2] + arm[2]) - height
+        if height == 0.0 or gap >= close:
+            continue
+        k = _BESIDE_M / math.sqrt(beside[0] ** 2 + beside[1] ** 2)
+        one = plane_at(relief, n + k * beside[0], e + k * beside[1])[0]
+        other = plane_at(relief, n - k * beside[0], e - k * beside[1])[0]
+        if height - 0.5 * (one + other) < _RIDGE * _BESIDE_M:
+            continue
+        k = _BESIDE_M / math.sqrt(along[0] ** 2 + along[1] ** 2)
+        rise = plane_at(relief, n + k * along[0], e + k * along[1])[0]
+        rise -= plane_at(relief, n - k * along[0], e - k * along[1])[0]
+        ridge = (2.0 * k * along[0], 2.0 * k * along[1], -rise)
+        cx = d[1] * ridge[2] - d[2] * ridge[1]
+        cy = d[2] * ridge[0] - d[0] * ridge[2]
+        cz = d[0] * ridge[1] - d[1] * ridge[0]
+        size = math.sqrt(cx * cx + cy * cy + cz * cz)
+        lengths = math.sqrt(d[0] ** 2 + d[1] ** 2 + d[2] ** 2)
+        lengths *= math.sqrt(ridge[0] ** 2 + ridge[1] ** 2 + ridge[2] ** 2)
+        if size < _PARALLEL * lengths or abs(cz) < 0.1 * size:
+            continue
+        per = (-1.0 if cz > 0.0 else 1.0) / size
+        normal = (per * cx, per * cy, per * cz)
+        count = note(rows, count, arm, normal, -normal[2] * gap, FLOOR_ID)
+    return count
