@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from airl_mav.arena.appearance import FLOOR as FLOOR_ROW
 from airl_mav.arena.appearance import OBSTACLE as OBSTACLE_ROW
 from airl_mav.arena.geometry import PlacedMesh
-from airl_mav.arena.ground import Ground, Relief, no_relief, plane_at
+from airl_mav.arena.ground import Ground, Relief, no_relief
+from airl_mav.arena.relief import plane_at
 from airl_mav.arena.triangles import KEPT, Triangles, triangles_of
 from airl_mav.camera.primitives import GROUND, OBSTACLE
 from airl_mav.camera.projection import MIN_DEPTH_M

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Shape
-from airl_mav.arena.ground import STEEPEST, Relief, extreme_within
+from airl_mav.arena.ground import STEEPEST, Relief
+from airl_mav.arena.relief import extreme_within
 from airl_mav.core.kernels import kernel
 from airl_mav.vehicle.rotation import Vec
 

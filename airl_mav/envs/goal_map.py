@@ -16,7 +16,8 @@ import scipy
 from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Shape
-from airl_mav.arena.ground import TOP, extreme_within
+from airl_mav.arena.ground import TOP
+from airl_mav.arena.relief import extreme_within
 from airl_mav.core.kernels import kernel
 from airl_mav.envs.arenas import ArenaBatch, relief_of
 

@@ -53,7 +53,8 @@ ALL_ROUND_DEG = 360.0
 
 STILL_COLOUR = "#8b97a3"
 
-HILLS_COLOUR = "#cbc6b4"
+HILLS_COLOURS = ("#e3dfd0", "#a8946a")
+"""Of low and of high ground."""
 
 MOST_CELLS = 4_000
 """Cells of hills on a page, for each flight."""
@@ -306,7 +307,14 @@ def _arena_traces(arena: Arena, *, obstacles: bool = True) -> list[Trace]:
     if arena.ground is not None and obstacles:
         hills = arena.ground.coarser(MOST_CELLS)
         body = (_east_north_up(hills.points), hills.faces.astype(np.int64))
-        traces.append(_mesh([body], HILLS_COLOUR, "ground"))
+        low, high = HILLS_COLOURS
+        shades = {
+            "intensity": _rounded(-hills.points[:, 2]),
+            "colorscale": [[0.0, low], [1.0, high]],
+            "showscale": False,
+            "flatshading": False,
+        }
+        traces.append(_mesh([body], low, "ground") | shades)
     if obstacles and arena.n_static:
         shown = drawn(arena.meshes, MOST_TRIANGLES)
         still = [

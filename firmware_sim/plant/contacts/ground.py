@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import math
 
-from airl_mav.arena.ground import COLUMNS, ROWS, TOP, Relief, extreme_within, plane_at
+from airl_mav.arena.ground import COLUMNS, ROWS, TOP, Relief
+from airl_mav.arena.relief import extreme_within, plane_at
 from airl_mav.core.frames import Vector
 from airl_mav.core.kernels import kernel, large_kernel
 from airl_mav.vehicle.rotation import Quat, Vec, conjugate, rotate
