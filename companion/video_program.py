@@ -91,7 +91,6 @@ def show_video(
 
     Raises:
         UsageError: The camera cannot be used.
-        OSError: The video cannot be sent.
     """
     wanted = Intrinsics.of(profile.camera)
     with closing(open_named_camera(camera, clock, wanted, f"vehicle {vehicle}")) as source:
@@ -121,7 +120,7 @@ def show_video(
             return network.running
 
         with closing(RtpVideo(*watcher, size, rate_hz)) as video:
-            return _send(source, first, video, profile.camera.range_m, is_wanted, stop)
+            return _send(source, first, video, profile.camera.range_m, is_wanted, stop, say)
 
 
 def _send(
@@ -131,13 +130,23 @@ def _send(
     range_m: float,
     wanted: Callable[[], bool],
     stop: threading.Event,
+    say: Callable[[str], None],
 ) -> int:
-    """Send frame after frame while they are wanted; return their number."""
-    sent, seen = 0, first
+    """Send frame after frame while they are wanted; return their number.
+
+    A radio link comes and goes: what cannot be sent is left out, which is said once.
+    """
+    sent, seen, failing = 0, first, False
     while not stop.is_set():
         if wanted():
-            video.show(picture_of(seen.frame, range_m), seen.received_us)
-            sent += 1
+            try:
+                video.show(picture_of(seen.frame, range_m), seen.received_us)
+            except OSError as error:
+                if not failing:
+                    say(f"the video cannot be sent: {error.strerror}; it goes on when it can")
+                failing = True
+            else:
+                sent, failing = sent + 1, False
         following = _next(source, seen, stop)
         if following is None:
             break

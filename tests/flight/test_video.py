@@ -20,12 +20,16 @@ from numpy.typing import NDArray
 
 from airl_mav.camera.frame import Frame, depth_to_z16
 from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.core.clock import WallClock
 from airl_mav.core.errors import EXIT_INTERRUPTED, FieldError, UsageError
+from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.video import video_words
 from airl_mav.scenario.model import Scenario
-from companion.video import GIMBAL_PORT, RtpVideo, picture_of, picture_size
+from companion.video import GIMBAL_PORT, RtpVideo, Watcher, picture_of, picture_size
+from companion.video_program import show_video
 from firmware_sim.mavlink.link import gimbal_link
 from firmware_sim.mavlink.udp_links import DEVICE_PORTS
+from firmware_sim.plant.camera_server import CameraServer
 from tests.support.command_line import airl
 from tests.support.ports import TestPorts, choose_ports
 from tests.support.processes import SITL_WITHOUT_REPORT, Running, running, wait_until
@@ -138,6 +142,39 @@ def test_a_picture_that_is_no_newer_is_left_out() -> None:
     for time_us in (100, 100, 50, 200_000):  # x264 would refuse a time that it has seen
         video.show(picture, time_us)
     video.close()
+
+
+def test_a_link_that_carries_nothing_ends_no_video() -> None:
+    """To the broadcast address the system lets nobody send who has not asked for it."""
+    port = udp_port()
+    with contextlib.closing(CameraServer("tcp://127.0.0.1:*")) as server:
+        said: list[str] = []
+        stop = threading.Event()
+
+        def publish() -> None:
+            frames = 0
+            while not stop.wait(0.02):
+                server.publish(depth_frame(np.full((48, 64), 3.0), frames))
+                frames += 1
+
+        publishing = threading.Thread(target=publish)
+        publishing.start()
+        ending = threading.Timer(3.0, stop.set)
+        ending.start()
+        sent = show_video(
+            server.endpoint,
+            "quad",
+            load_vehicle("quad"),
+            Watcher("255.255.255.255", port),
+            None,
+            WallClock(),
+            stop,
+            said.append,
+        )
+        publishing.join()
+        ending.join()
+    assert sent == 0
+    assert sum("cannot be sent" in line for line in said) == 1
 
 
 @pytest.mark.parametrize(
