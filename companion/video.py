@@ -10,7 +10,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.camera.frame import MM_PER_M, Frame, rgb_of
+from airl_mav.camera.frame import MM_PER_M, Frame, FurtherImage, rgb_of
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.constants import US_PER_S
 
@@ -38,14 +38,14 @@ class Watcher(NamedTuple):
     port: int
 
 
-def picture_of(frame: Frame, range_m: float) -> NDArray[np.uint8]:
-    """Return a frame as a picture (h, w, 3) of even sides, at least `LEAST_PX` wide.
+def picture_of(frame: Frame | FurtherImage, range_m: float) -> NDArray[np.uint8]:
+    """Return an image as a picture (h, w, 3) of even sides, at least `LEAST_PX` wide.
 
     Depth is grey: near is bright, by the square root, which shows near things best; what has no
     return is black.
 
     Args:
-        frame: Of the camera.
+        frame: Of the camera; of several cameras the main one's is shown.
         range_m: Farthest depth that the camera returns [m]; of a depth camera alone.
     """
     if frame.intrinsics.kind == "depth":

@@ -6,16 +6,19 @@ import math
 import threading
 from collections.abc import Callable
 from contextlib import closing
-from typing import Any
+from typing import Any, NamedTuple
 
 from mavsdk import ComponentType, Mavsdk
 
+from airl_mav.camera.frame import Frame, FurtherImage
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.clock import Clock
+from airl_mav.core.errors import FieldError
+from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.vehicle import VehicleProfile
 from companion.camera import FrameSource, ReceivedFrame
 from companion.camera_component import CameraComponent, Stream
-from companion.cameras.by_name import open_named_camera
+from companion.cameras.by_name import OpenCamera, open_named_camera
 from companion.mavsdk_connection import open_connection
 from companion.video import RtpVideo, Watcher, picture_of, picture_size
 
@@ -67,10 +70,45 @@ def _vehicle(mavsdk: Mavsdk) -> Any:
     return next((system for system in mavsdk.get_systems() if system.has_autopilot()), None)
 
 
+class ShownCamera(NamedTuple):
+    """Whose images are shown."""
+
+    camera: str
+    """As `open_named_camera` takes it."""
+    vehicle: str
+    profile: VehicleProfile
+    """Whose camera that is: its rate, its lens and range."""
+    name: str | None = None
+    """Of the further camera that is shown; None: the main one is."""
+
+    @property
+    def own(self) -> Camera:
+        """The camera of the profile. Raises FieldError for a name that is none."""
+        if self.name is None:
+            return self.profile.camera
+        if self.name not in self.profile.cameras:
+            has = ", ".join(self.profile.cameras) or "left out, as it has its main one alone"
+            raise FieldError("camera_name", self.name, f"of vehicle {self.vehicle}: {has}")
+        return self.profile.cameras[self.name]
+
+    def open(self, clock: Clock) -> OpenCamera:
+        """Open it. Raises FieldError as `open_named_camera`."""
+        further = {name: Intrinsics.of(each) for name, each in self.profile.cameras.items()}
+        wanted, whose = Intrinsics.of(self.profile.camera), f"vehicle {self.vehicle}"
+        return open_named_camera(self.camera, clock, wanted, whose, further)
+
+    def image(self, frame: Frame) -> Frame | FurtherImage:
+        """Return its image of a frame. Raises FieldError where there is none."""
+        if self.name is None:
+            return frame
+        if self.name not in frame.further:
+            has = ", ".join(frame.further) or "left out, as there are those of the main one alone"
+            raise FieldError("camera_name", self.name, f"whose images come: {has}")
+        return frame.further[self.name]
+
+
 def show_video(
-    camera: str,
-    vehicle: str,
-    profile: VehicleProfile,
+    camera: ShownCamera,
     watcher: Watcher,
     network: OnNetwork | None,
     clock: Clock,
@@ -80,9 +118,7 @@ def show_video(
     """Send what a camera sees until somebody stops it; return the number of pictures.
 
     Args:
-        camera: Its name, as `open_named_camera` takes it.
-        vehicle: Name of the profile.
-        profile: Whose camera that is: its rate, its lens and range.
+        camera: Whose images are shown.
         watcher: Who is sent the video.
         network: Where ground stations are told of it; None: nobody is.
         clock: For the stamps.
@@ -90,18 +126,18 @@ def show_video(
         say: Called with lines for the user.
 
     Raises:
-        UsageError: The camera cannot be used.
+        UsageError: The camera cannot be used, or there is none of that name.
     """
-    wanted = Intrinsics.of(profile.camera)
-    with closing(open_named_camera(camera, clock, wanted, f"vehicle {vehicle}")) as source:
-        say(f"waiting for images of {camera}")
+    own = camera.own
+    with closing(camera.open(clock)) as source:
+        say(f"waiting for images of {camera.camera}")
         first = _next(source, None, stop)
         if first is None:
             return 0
-        lens = first.frame.intrinsics
-        size, rate_hz = picture_size(lens), profile.camera.rate_hz
+        lens = camera.image(first.frame).intrinsics
+        size, rate_hz = picture_size(lens), own.rate_hz
         stream = Stream(
-            f"{vehicle} {lens.kind}",
+            f"{camera.vehicle} {lens.kind}",
             size,
             rate_hz,
             math.degrees(lens.horizontal_fov_rad),
@@ -120,14 +156,17 @@ def show_video(
             return network.running
 
         with closing(RtpVideo(*watcher, size, rate_hz)) as video:
-            return _send(source, first, video, profile.camera.range_m, is_wanted, stop, say)
+
+            def show(seen: ReceivedFrame) -> None:
+                video.show(picture_of(camera.image(seen.frame), own.range_m), seen.received_us)
+
+            return _send(source, first, show, is_wanted, stop, say)
 
 
 def _send(
     source: FrameSource,
     first: ReceivedFrame,
-    video: RtpVideo,
-    range_m: float,
+    show: Callable[[ReceivedFrame], None],
     wanted: Callable[[], bool],
     stop: threading.Event,
     say: Callable[[str], None],
@@ -140,7 +179,7 @@ def _send(
     while not stop.is_set():
         if wanted():
             try:
-                video.show(picture_of(seen.frame, range_m), seen.received_us)
+                show(seen)
             except OSError as error:
                 if not failing:
                     say(f"the video cannot be sent: {error.strerror}; it goes on when it can")

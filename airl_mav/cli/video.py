@@ -31,10 +31,16 @@ class VideoOptions(ProfileModel):
         airl video
         airl video --to 192.168.1.5:5600 --connect udpin://0.0.0.0:13280
         airl video --vehicle my-quad.toml --camera realsense
+        airl video --vehicle quad-rig --camera-name down
     """
 
     camera: CameraName = "tcp://127.0.0.1:5600"
     vehicle: VehicleName = DEFAULT_VEHICLE
+    camera_name: str | None = Field(
+        default=None,
+        description="further camera of the vehicle whose images are shown; by default those of the"
+        " main one",
+    )
     to: str = Field(
         default="127.0.0.1:5600",
         description="HOST:PORT of who watches: UDP, H.264 in RTP; QGroundControl listens on 5600",
@@ -56,7 +62,7 @@ EXTRAS = ("film",)
 def run(options: VideoOptions, console: Console | None = None) -> int:
     """Send the video until Ctrl-C. Exit status: 0."""
     # Imported here: help needs no MAVSDK.
-    from companion.video_program import OnNetwork, show_video
+    from companion.video_program import OnNetwork, ShownCamera, show_video
 
     console = console or new_console(soft_wrap=True)
     watcher = watcher_of(options.to)
@@ -69,8 +75,9 @@ def run(options: VideoOptions, console: Console | None = None) -> int:
         stop = threading.Event()
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: stop.set())
+        camera = ShownCamera(options.camera, options.vehicle, profile, options.camera_name)
         sent = show_video(
-            *(options.camera, options.vehicle, profile, watcher, network, clock, stop),
+            *(camera, watcher, network, clock, stop),
             lambda text: console.print(text, highlight=False),
         )
     console.print(f"{sent} pictures sent", highlight=False)

@@ -18,7 +18,7 @@ from mavsdk import ComponentType, Configuration, Mavsdk
 from mavsdk.plugins.camera import Camera, CameraError, CameraResult, VideoStreamInfo
 from numpy.typing import NDArray
 
-from airl_mav.camera.frame import Frame, depth_to_z16
+from airl_mav.camera.frame import Frame, FurtherImage, depth_to_z16
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.clock import WallClock
 from airl_mav.core.errors import EXIT_INTERRUPTED, FieldError, UsageError
@@ -26,7 +26,7 @@ from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.video import video_words
 from airl_mav.scenario.model import Scenario
 from companion.video import GIMBAL_PORT, RtpVideo, Watcher, picture_of, picture_size
-from companion.video_program import show_video
+from companion.video_program import ShownCamera, show_video
 from firmware_sim.mavlink.link import gimbal_link
 from firmware_sim.mavlink.udp_links import DEVICE_PORTS
 from firmware_sim.plant.camera_server import CameraServer
@@ -136,6 +136,45 @@ def test_a_player_sees_what_was_sent(tmp_path: Path) -> None:
     assert abs(int(found[-1][100, 150, 0]) - int(picture[100, 150, 0])) < 10
 
 
+def test_a_further_camera_is_shown_by_its_name(tmp_path: Path) -> None:
+    """The grey image of a rig, which is twice as bright on its right."""
+    port, stop = udp_port(), threading.Event()
+    grey = np.full((48, 64, 1), 60, np.uint8)
+    grey[:, 32:] = 180
+    further = {"down": FurtherImage(grey, Intrinsics.from_fov(64, 48, 1.4, kind="grey"))}
+    vehicle = load_vehicle("quad-rig")
+    with contextlib.closing(CameraServer("tcp://127.0.0.1:*")) as server:
+
+        def publish() -> None:
+            frames = 0
+            while not stop.wait(0.03):
+                main = depth_frame(np.full((48, 64), 3.0), frames)
+                server.publish(replace(main, further=further))
+                frames += 1
+
+        said: list[str] = []
+        watcher = Watcher("127.0.0.1", port)
+
+        def show() -> None:
+            camera = ShownCamera(server.endpoint, "quad-rig", vehicle, "down")
+            show_video(camera, watcher, None, WallClock(), stop, said.append)
+
+        threads = [threading.Thread(target=each) for each in (publish, show)]
+        for thread in threads:
+            thread.start()
+        try:
+            seen = watched(tmp_path, port, 3)[-1].astype(int)
+        finally:
+            stop.set()
+            for thread in threads:
+                thread.join()
+        assert abs(seen[:, :150].mean() - 60) < 8
+        assert abs(seen[:, 170:].mean() - 180) < 8
+        wrong = ShownCamera(server.endpoint, "quad-rig", vehicle, "up")
+        with pytest.raises(FieldError, match="down, left, right"):
+            show_video(wrong, watcher, None, WallClock(), stop, said.append)
+
+
 def test_a_picture_that_is_no_newer_is_left_out() -> None:
     video = RtpVideo("127.0.0.1", udp_port(), (320, 240), 20.0)
     picture = np.zeros((240, 320, 3), np.uint8)
@@ -162,9 +201,7 @@ def test_a_link_that_carries_nothing_ends_no_video() -> None:
         ending = threading.Timer(3.0, stop.set)
         ending.start()
         sent = show_video(
-            server.endpoint,
-            "quad",
-            load_vehicle("quad"),
+            ShownCamera(server.endpoint, "quad", load_vehicle("quad")),
             Watcher("255.255.255.255", port),
             None,
             WallClock(),
