@@ -76,20 +76,24 @@ def rig(tmp_path: Path) -> Path:
     return path
 
 
-def test_the_plant_s_cameras_take_the_same_images(rig: Path) -> None:
+@pytest.mark.timeout(600)  # compiles kernels, on a busy machine for minutes
+@pytest.mark.parametrize(
+    "arena", ["dynamic-obstacles", pytest.param("hills", marks=pytest.mark.nightly)]
+)
+def test_the_plant_s_cameras_take_the_same_images(rig: Path, arena: str) -> None:
     """Of all kinds of error: matching, ranging, exposure in motion, noise of photons."""
     noise = SensorNoise(depth_noise=0.02, depth_dropout=0.02)
-    env = flown(rig_env(rig, randomisation=noise.model_dump()))
+    env = flown(rig_env(rig, arena=arena, randomisation=noise.model_dump()))
     everyone, fleet = np.ones(2, np.bool_), env.fleet
     env.cameras.capture(fleet, env._places.batch, everyone, env.seeds)
     numbers = env.cameras._frames(fleet.time_us)
-    for i, arena in enumerate(env.arenas):
-        assert arena is not None
+    for i, world in enumerate(env.arenas):
+        assert world is not None
         motion = Motion(fleet.position[i], fleet.quaternion[i], fleet.velocity[i], fleet.omega[i])
         assert np.abs(motion.velocity).max() > 0.5
         seed = int(env.seeds[i])
         plant = SimulatedCamera(
-            *(env.camera, arena, 0, noise, seed, "raycast", env.vehicle.cameras)
+            *(env.camera, world, 0, noise, seed, "raycast", env.vehicle.cameras)
         )
         taken = {"": plant._main, **plant._further}
         twin = {"": env.cameras._main, **env.cameras.further}

@@ -27,7 +27,7 @@ def test_a_damaged_file_is_read_or_refused_in_one_line(kind: str) -> None:
 
 
 def test_a_companion_decides_on_sound_frames_alone() -> None:
-    for number in (1, 11):  # of one camera, and of two
+    for number in range(12):  # all lenses, of one camera and of two
         refused = int(see_hostile_frames(number).split()[0])
         assert 5 < refused < 50
 
