@@ -18,7 +18,6 @@ from airl_mav.envs.encoding import COMPILED
 from airl_mav.envs.fleet import new_fleet
 from airl_mav.envs.meshes import MeshesSeen
 from airl_mav.lockstep.flight import fly
-from airl_mav.policy.actions import Action
 from airl_mav.policy.card import load_card
 from airl_mav.policy.layouts import encode_layout
 from airl_mav.policy.learned import LearnedPolicy
@@ -27,6 +26,7 @@ from airl_mav.scenario.resolved import ResolvedScenario
 from firmware_sim.plant.camera_server import SimulatedCamera
 from tests.support.command_line import airl
 from tests.support.lockstep_kit import demo_scenario
+from tests.support.trained_here import Watching, trained
 
 SEED = 3
 
@@ -58,25 +58,10 @@ rate_hz = 5.0
 """
 
 
-class Watching:
-    """A learned policy, and what it was shown."""
-
-    def __init__(self, policy: LearnedPolicy, seen: list[Observation]) -> None:
-        self._policy, self._seen = policy, seen
-
-    def act(self, observation: Observation) -> Action:
-        self._seen.append(observation)
-        return self._policy.act(observation)
-
-
 @pytest.fixture(scope="module")
 def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the folder of a policy that was trained to see colour."""
-    folder = tmp_path_factory.mktemp("colour")
-    (folder / "rgb.toml").write_text(TRAINING, encoding="utf-8")
-    code, text = airl("train", str(folder / "rgb.toml"), "--out", str(folder / "run"))
-    assert code == 0, text
-    return folder / "run" / "policy"
+    return trained(tmp_path_factory.mktemp("colour"), "rgb", TRAINING)
 
 
 def scenario(policy: Path, **changes: object) -> ResolvedScenario:

@@ -26,7 +26,6 @@ from airl_mav.envs.sb3 import NavigationVecEnv
 from airl_mav.envs.spec import spec_of
 from airl_mav.envs.vector import NavigationVectorEnv
 from airl_mav.lockstep.flight import fly
-from airl_mav.policy.actions import Action
 from airl_mav.policy.card import load_card
 from airl_mav.policy.layouts import encode_layout
 from airl_mav.policy.learned import LearnedPolicy, load_learned
@@ -42,6 +41,7 @@ from firmware_sim.plant.camera_server import SimulatedCamera
 from tests.support.command_line import airl
 from tests.support.lockstep_kit import demo_scenario
 from tests.support.ports import LOOPBACK, free_ports
+from tests.support.trained_here import Watching, trained
 
 SEED = 3
 
@@ -67,25 +67,10 @@ episodes = 2
 """
 
 
-class Watching:
-    """A learned policy, and what it was shown."""
-
-    def __init__(self, policy: LearnedPolicy, seen: list[Observation]) -> None:
-        self._policy, self._seen = policy, seen
-
-    def act(self, observation: Observation) -> Action:
-        self._seen.append(observation)
-        return self._policy.act(observation)
-
-
 @pytest.fixture(scope="module")
 def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the folder of a policy that was trained to see by three cameras."""
-    folder = tmp_path_factory.mktemp("rig")
-    (folder / "rig.toml").write_text(TRAINING, encoding="utf-8")
-    code, text = airl("train", str(folder / "rig.toml"), "--out", str(folder / "run"))
-    assert code == 0, text
-    return folder / "run" / "policy"
+    return trained(tmp_path_factory.mktemp("rig"), "rig", TRAINING)
 
 
 def scenario(policy: Path, **changes: object) -> ResolvedScenario:

@@ -1,0 +1,30 @@
+"""Policies that a test trains, and what they are shown when they fly."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from airl_mav.policy.actions import Action
+from airl_mav.policy.learned import LearnedPolicy
+from airl_mav.policy.observation import Observation
+from tests.support.command_line import airl
+
+
+class Watching:
+    """A learned policy, and what it was shown."""
+
+    def __init__(self, policy: LearnedPolicy, seen: list[Observation]) -> None:
+        self._policy, self._seen = policy, seen
+
+    def act(self, observation: Observation) -> Action:
+        self._seen.append(observation)
+        return self._policy.act(observation)
+
+
+def trained(folder: Path, name: str, training: str) -> Path:
+    """Train what the file of a training says, of this name; return the folder of its policy."""
+    file = folder / f"{name}.toml"
+    file.write_text(training, encoding="utf-8")
+    code, text = airl("train", str(file), "--out", str(folder / "run"))
+    assert code == 0, text
+    return folder / "run" / "policy"
