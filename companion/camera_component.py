@@ -174,7 +174,7 @@ class CameraComponent:
         """
         self.running = True
         """Whether the video is wanted: clients may stop it, and start it again."""
-        self._stream, self._clock = stream, clock
+        self._clock = clock
         self._messages: dict[int, tuple[str, Callable[[], Fields]]] = {
             CAMERA_INFORMATION: ("CAMERA_INFORMATION", lambda: camera_information(stream)),
             CAMERA_SETTINGS: ("CAMERA_SETTINGS", lambda: {"mode_id": MODE_VIDEO}),

@@ -10,7 +10,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.camera.frame import MM_PER_M, Frame, FurtherImage, rgb_of
+from airl_mav.camera.frame import Frame, FurtherImage, nearness, rgb_of
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.constants import US_PER_S
 
@@ -20,6 +20,9 @@ flight controller of `airl-firmware`, too: a link that is fast enough, and is no
 
 LEAST_PX: Final = 320
 """A picture is enlarged by a whole factor until it is at least so wide, each pixel a square."""
+
+DARKEST: Final = 32.0
+"""Grey of what is as far as a depth camera sees, of 255: more than of what has no return."""
 
 KEYFRAME_S: Final = 1.0
 """Whoever begins to watch sees a picture after this time at most [s]."""
@@ -41,23 +44,22 @@ class Watcher(NamedTuple):
 def picture_of(frame: Frame | FurtherImage, range_m: float) -> NDArray[np.uint8]:
     """Return an image as a picture (h, w, 3) of even sides, at least `LEAST_PX` wide.
 
-    Depth is grey: near is bright, by the square root, which shows near things best; what has no
-    return is black.
+    Depth is grey: near is bright, and what has no return is black.
 
     Args:
-        frame: Of the camera; of several cameras the main one's is shown.
+        frame: Of the camera; a whole frame shows the main one.
         range_m: Farthest depth that the camera returns [m]; of a depth camera alone.
     """
     if frame.intrinsics.kind == "depth":
-        share = np.sqrt(np.clip(frame.image / (MM_PER_M * range_m), 0.0, 1.0))
-        grey = np.where(frame.image == 0, 0.0, 255.0 - 223.0 * share).astype(np.uint8)
+        shade = DARKEST + (255.0 - DARKEST) * nearness(frame.image, range_m)
+        grey = np.where(frame.image == 0, 0.0, shade).astype(np.uint8)
         picture = rgb_of(grey[..., None])
     else:
         picture = rgb_of(frame.image)
     times = enlargement(frame.intrinsics)
     larger = picture.repeat(times, axis=0).repeat(times, axis=1)
     # H.264 with subsampled colour has even sides only.
-    height, width = larger.shape[0] // 2 * 2, larger.shape[1] // 2 * 2
+    width, height = picture_size(frame.intrinsics)
     return np.ascontiguousarray(larger[:height, :width])
 
 

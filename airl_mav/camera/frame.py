@@ -285,6 +285,15 @@ def rgb_of(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.repeat(image, 3, axis=2) if image.shape[2] == 1 else image
 
 
+def nearness(depth_mm: NDArray[Any], range_m: float) -> NDArray[np.float64]:
+    """Return how near a depth image [mm] is, for pictures: 1 at the camera, 0 at a range [m].
+
+    By the square root, which shows near things best. What has no return is as the camera itself.
+    """
+    near: NDArray[np.float64] = 1.0 - np.sqrt(np.clip(depth_mm / (MM_PER_M * range_m), 0.0, 1.0))
+    return near
+
+
 def depth_to_z16(depth_m: NDArray[np.floating]) -> NDArray[np.uint16]:
     """Turn metres (0 = no return) into Z16 millimetres, rounded, clipped to 65,535 mm."""
     z16: NDArray[np.uint16] = np.clip(np.rint(depth_m * MM_PER_M), 0, MAX_MM).astype(np.uint16)

@@ -106,7 +106,7 @@ class CameraChange(ProfileModel):
         return made
 
 
-class FurtherImage(ProfileModel):
+class FurtherView(ProfileModel):
     """The image of a further camera, as the network sees it."""
 
     image_width_px: int | None = quantity(
@@ -301,7 +301,7 @@ class EnvironmentSpec(ProfileModel):
         description="of unsteady commands, energy and failures, beside the reward",
     )
     camera: CameraChange = Field(default_factory=CameraChange, description="camera, if another")
-    cameras: dict[CameraName, FurtherImage] = Field(
+    cameras: dict[CameraName, FurtherView] = Field(
         default_factory=dict,
         description="further cameras of the vehicle that the network sees by, by their names",
     )

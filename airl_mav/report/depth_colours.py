@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib import colormaps
 from numpy.typing import NDArray
 
-from airl_mav.camera.frame import MM_PER_M, rgb_of
+from airl_mav.camera.frame import nearness, rgb_of
 
 NO_RETURN = "#262a30"
 """Colour of pixels that the camera has no depth of: that of the live view."""
@@ -19,12 +19,9 @@ LEVELS = 255
 
 
 def shades(depth_mm: NDArray[np.uint16], range_m: float) -> NDArray[np.uint8]:
-    """Return a depth image (h, w) [mm] as bytes: 0 no return, 1 at `range_m`, 255 at the camera.
-
-    By the square root, which shows near things best.
-    """
-    share = np.sqrt(np.clip(depth_mm / (MM_PER_M * range_m), 0.0, 1.0))
-    bytes_of: NDArray[np.uint8] = (1.0 + np.round((LEVELS - 1) * (1.0 - share))).astype(np.uint8)
+    """Return a depth image (h, w) [mm] as bytes: 0 no return, 1 at `range_m`, 255 at the camera."""
+    scaled = np.round((LEVELS - 1) * nearness(depth_mm, range_m))
+    bytes_of: NDArray[np.uint8] = (1.0 + scaled).astype(np.uint8)
     bytes_of[depth_mm == 0] = 0
     return bytes_of
 

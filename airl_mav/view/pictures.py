@@ -10,7 +10,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.camera.frame import MM_PER_M, rgb_of
+from airl_mav.camera.frame import nearness, rgb_of
 from airl_mav.core.constants import US_PER_S
 from airl_mav.view.messages import Image
 from airl_mav.view.shown import Shown
@@ -37,9 +37,7 @@ def camera_picture(image: Image, range_m: float) -> NDArray[np.uint8]:
     if image.ndim == 3:
         picture = rgb_of(image)
     else:
-        # By the square root, which shows near things best.
-        share = np.sqrt(np.clip(image / (MM_PER_M * range_m), 0.0, 1.0))
-        picture = _colours()[(255.0 * (1.0 - share)).astype(np.uint8)]
+        picture = _colours()[(255.0 * nearness(image, range_m)).astype(np.uint8)]
         picture[image == 0] = NO_RETURN
     times = max(1, math.ceil(LEAST_PX / picture.shape[1]))
     larger: NDArray[np.uint8] = np.kron(picture, np.ones((times, times, 1), np.uint8))

@@ -128,7 +128,9 @@ def test_a_batch_has_the_ground_of_each_arena(worlds: list[Arena]) -> None:
         else:
             np.testing.assert_array_equal(relief.heights, world.ground.heights.ravel())
             np.testing.assert_array_equal(relief.grid, world.ground.relief.grid)
-    np.testing.assert_array_equal(relief_of(batch, 1).grid, worlds[0].ground.relief.grid)  # type: ignore[union-attr]
+    first = worlds[0].ground
+    assert first is not None
+    np.testing.assert_array_equal(relief_of(batch, 1).grid, first.relief.grid)
 
 
 def test_on_the_planner_s_map_ground_at_the_height_of_the_flight_is_in_the_way(
