@@ -26,6 +26,10 @@ LATE_US = 500_000
 PANEL_S = 0.2
 """Time between two drawings of the panel and the camera's image [wall s]."""
 
+GLIDE_S = 0.1
+"""In so much time the scene follows the slider [wall s]: a page without a GPU tells of it
+every 0.09 s."""
+
 STEP_S = 0.02
 """Step of the slider: that of the recording [s]."""
 
@@ -70,6 +74,10 @@ class ReplayPage:
         self._since_panel_s = PANEL_S
         self._slid = False
         """Whether the slider is where it is because somebody drags it."""
+        self._slid_to_s = 0.0
+        """Where it was dragged."""
+        self._glides_s = 0.0
+        """In how much time the scene is there [wall s]; 0: it does not follow it."""
         self._drawn = 0
         self._choose(first or run.records[0])
 
@@ -90,8 +98,7 @@ class ReplayPage:
         @self._time.on_update
         def _(event: Any) -> None:
             if event.client is not None:
-                self._playing = False
-                self._go_to(self._time.value, slid=True)
+                self._slide_to(self._time.value)
 
         @self._buttons.on_click
         def _(_event: object) -> None:
@@ -139,6 +146,12 @@ class ReplayPage:
     def _go_to(self, seconds: float, *, slid: bool = False) -> None:
         self._seconds = min(max(0.0, seconds), self._flight.duration_s)
         self._dirty, self._slid = True, slid
+        if not slid:
+            self._glides_s = 0.0
+
+    def _slide_to(self, seconds: float) -> None:
+        self._playing = False
+        self._slid_to_s, self._glides_s = seconds, GLIDE_S
 
     # --- drawing
 
@@ -159,6 +172,13 @@ class ReplayPage:
         if self._playing:
             self._go_to(self._seconds + wall_s * SPEEDS[self._speed.value])
             self._playing = self._seconds < self._flight.duration_s
+        elif self._glides_s > wall_s:
+            share = wall_s / self._glides_s
+            self._glides_s -= wall_s
+            self._go_to(self._seconds + share * (self._slid_to_s - self._seconds), slid=True)
+        elif self._glides_s > 0.0:
+            self._glides_s = 0.0
+            self._go_to(self._slid_to_s, slid=True)
         self._since_panel_s += wall_s
         due = self._since_panel_s >= PANEL_S
         if self._dirty:
