@@ -44,9 +44,12 @@ def sized(value: float) -> float:
 def widened(left: int, end: int, low: int, high: int) -> tuple[int, int]:
     """Return the pixels left..end with their neighbours from low to high, in whole vectors.
 
-    What is left over of a loop for vectors is done one by one: for what is small, all of it.
+    What is left over of a loop for vectors is done one by one: for what is small, all of it. They
+    begin where the pixels do: few pixels across a vector's boundary would be two.
     """
-    return max(left - left % VECTOR, low), min(end + (-end) % VECTOR, high)
+    whole = end - left + (left - end) % VECTOR
+    first = max(min(left, high - whole), low)
+    return first, min(first + whole, high)
 
 
 @kernel
