@@ -230,8 +230,13 @@ def _light(appearance: Appearance, draw: int) -> Light:
 
 
 def linear_of(encoded: Floats) -> Floats:
-    """Return linear light of sRGB values, both 0..1 (IEC 61966-2-1)."""
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    """Return linear light of sRGB values, both 0..1 (IEC 61966-2-1).
+
+    The same to the bit on every processor, as what a seed draws must be: numpy's own power has
+    other last bits where there is AVX-512. So it is slow; for a picture's pixels make a table.
+    """
+    raised = [x**2.4 for x in ((encoded + 0.055) / 1.055).ravel().tolist()]
+    return np.where(encoded <= 0.04045, encoded / 12.92, np.reshape(raised, encoded.shape))
 
 
 def srgb_of(linear: Floats) -> Floats:

@@ -46,13 +46,13 @@ def texels_of(file: ImageFile, side: int) -> Floats:
     try:
         with Image.open(io.BytesIO(data), formats=FORMATS) as picture:
             _check(picture, file.file)
-            pixels = np.asarray(picture.convert("RGB"), np.float64) / 255.0
+            pixels = np.asarray(picture.convert("RGB"))
     except UsageError:
         raise
     except Exception as error:  # Whatever a decoder makes of a damaged file.
         words = " ".join(str(error).split()) or type(error).__name__
         raise UsageError(f"{file.file}: no PNG or JPEG that can be read: {words[:200]}") from None
-    light = linear_of(pixels).astype(np.float32)
+    light = linear_of(np.arange(256) / 255.0).astype(np.float32)[pixels]
     how = Image.Resampling.BOX if len(light) >= side else Image.Resampling.BILINEAR
     planes = [
         np.asarray(Image.fromarray(np.ascontiguousarray(plane)).resize((side, side), how))
