@@ -100,7 +100,9 @@ def test_frames_are_those_of_a_camera_for_which_time_waits(process: CameraProces
     the_same_in_place(frames, 8_000)
     times = [frame.capture_time_us for frame in frames]
     assert times[0] == 8_000
-    assert all(later - earlier >= SLOT_US - TICK_US for earlier, later in pairwise(times))
+    # One a slot, wherever in it the camera was free: on a busy machine it may be late in one.
+    slots = [(time_us - 8_000) // SLOT_US for time_us in times]
+    assert all(later > earlier for earlier, later in pairwise(slots))
 
 
 def test_one_at_a_time_and_slots_that_pass_meanwhile_are_left_out(process: CameraProcess) -> None:
