@@ -7,7 +7,7 @@ says of wrong input into one line.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from types import UnionType
 from typing import Any, TypeVar, Union, get_args, get_origin
@@ -63,6 +63,7 @@ def quantity(
     le: float | None = None,
     lt: float | None = None,
     default: Any = PydanticUndefined,
+    later: bool = False,
 ) -> Any:
     """Declare a number, an optional number or a list of numbers, with its unit and range.
 
@@ -74,6 +75,7 @@ def quantity(
         le: Greatest value allowed.
         lt: Value that it must stay below.
         default: Value when it is left out; none means that it is required.
+        later: It is dumped as `later_field` says.
     """
     scalar = any(bound is not None for bound in (ge, gt, le, lt))
     return Field(
@@ -86,7 +88,35 @@ def quantity(
         le=le,
         lt=lt,
         json_schema_extra={"unit": unit},
+        exclude_if=_equals(default) if later else None,
     )
+
+
+def later_field(default: Any, description: str | None = None) -> Any:
+    """Declare a field that came later than digests and cards of such models.
+
+    Where it is as by default it is left out of what is dumped: they stay as they were without it.
+
+    Args:
+        default: Its value when it is left out, or the type that makes one.
+        description: What it means; None: its type tells.
+    """
+    made = default() if isinstance(default, type) else default
+    given: dict[str, Any] = (
+        {"default_factory": default} if isinstance(default, type) else {"default": default}
+    )
+    if description is not None:
+        given["description"] = description
+    return Field(**given, exclude_if=_equals(made))
+
+
+def _equals(default: Any) -> Callable[[Any], bool]:
+    """Return what tells whether a value is a default."""
+
+    def is_default(value: Any) -> bool:
+        return bool(value == default)
+
+    return is_default
 
 
 @dataclass(frozen=True)

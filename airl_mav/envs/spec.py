@@ -7,13 +7,11 @@ from typing import Annotated, Any, Literal
 
 from pydantic import (
     Field,
-    SerializerFunctionWrapHandler,
-    model_serializer,
     model_validator,
 )
 
 from airl_mav.core.errors import UsageError
-from airl_mav.core.fields import Each, ProfileModel, quantity, validated
+from airl_mav.core.fields import Each, ProfileModel, later_field, quantity, validated
 from airl_mav.core.plugins import REWARDS, part_name
 from airl_mav.flight.judge import GOAL_RADIUS_M, TIME_LIMIT_S, GoalRadius, TimeLimit
 from airl_mav.policy.action_sets import PAPER_SPEED_M_S, ActionSetName, ActionSpec
@@ -301,9 +299,8 @@ class EnvironmentSpec(ProfileModel):
         description="of unsteady commands, energy and failures, beside the reward",
     )
     camera: CameraChange = Field(default_factory=CameraChange, description="camera, if another")
-    cameras: dict[CameraName, FurtherView] = Field(
-        default_factory=dict,
-        description="further cameras of the vehicle that the network sees by, by their names",
+    cameras: dict[CameraName, FurtherView] = later_field(
+        dict, "further cameras of the vehicle that the network sees by, by their names"
     )
     episode: EpisodeRules = Field(default_factory=EpisodeRules, description="rules")
     delay: Delay = Field(default_factory=Delay, description="how late decisions are")
@@ -327,14 +324,6 @@ class EnvironmentSpec(ProfileModel):
     curriculum: Curriculum | None = Field(
         default=None, description="zones by success; left out: the whole arena from the start"
     )
-
-    @model_serializer(mode="wrap")
-    def _without_unused(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        # What is noted of an environment of one camera is what it was before there were more.
-        data: dict[str, Any] = dump(self)
-        if not self.cameras:
-            data.pop("cameras", None)
-        return data
 
     @model_validator(mode="after")
     def _decides_in_time(self) -> EnvironmentSpec:

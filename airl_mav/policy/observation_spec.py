@@ -11,14 +11,12 @@ from numpy.typing import NDArray
 from pydantic import (
     AfterValidator,
     Field,
-    SerializerFunctionWrapHandler,
-    model_serializer,
     model_validator,
 )
 
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core import plugins
-from airl_mav.core.fields import ProfileModel, quantity
+from airl_mav.core.fields import ProfileModel, later_field, quantity
 from airl_mav.policy.scans import goes_round
 from airl_mav.profiles.camera import Coefficients
 from airl_mav.profiles.camera_kind import CHANNELS, CameraKind
@@ -116,19 +114,12 @@ class SeenCamera(ProfileModel):
     width_px: Width
     projection: SeenProjection = "pinhole"
     horizontal_fov_deg: FieldOfView
-    distortion: SeenDistortion = UNDISTORTED
+    distortion: SeenDistortion = later_field(UNDISTORTED)
     range_m: Range
     kind: CameraKind = Field(
         default="depth", description="what the camera gives, which begins the image's key"
     )
     frames: Frames = 1
-
-    @model_serializer(mode="wrap")
-    def _without_unused(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        data: dict[str, Any] = dump(self)
-        if self.distortion == UNDISTORTED:
-            data.pop("distortion", None)
-        return data
 
     @model_validator(mode="after")
     def _sees(self) -> SeenCamera:
@@ -160,7 +151,7 @@ class ObservationSpec(ProfileModel):
     width_px: Width
     projection: SeenProjection = "pinhole"
     horizontal_fov_deg: FieldOfView
-    distortion: SeenDistortion = UNDISTORTED
+    distortion: SeenDistortion = later_field(UNDISTORTED)
     range_m: Range
     kind: CameraKind = Field(
         default="depth",
@@ -172,24 +163,12 @@ class ObservationSpec(ProfileModel):
         description="what else the network is told: command, the newest setpoint; latency, the t2"
         " that is expected; age, of the image",
     )
-    goal_height: GoalHeight = False
-    cameras: dict[CameraName, SeenCamera] = Field(
-        default_factory=dict,
-        description="further cameras that the network sees by, by name; the image of camera NAME"
+    goal_height: GoalHeight = later_field(default=False)
+    cameras: dict[CameraName, SeenCamera] = later_field(
+        dict,
+        "further cameras that the network sees by, by name; the image of camera NAME"
         " has the key KIND_NAME",
     )
-
-    @model_serializer(mode="wrap")
-    def _without_unused(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out what says nothing: a card reads as before there was a choice."""
-        data: dict[str, Any] = dump(self)
-        if not self.goal_height:
-            data.pop("goal_height", None)
-        if self.distortion == UNDISTORTED:
-            data.pop("distortion", None)
-        if not self.cameras:
-            data.pop("cameras", None)
-        return data
 
     @model_validator(mode="after")
     def _camera_has_rows(self) -> ObservationSpec:

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import Field, model_validator
 
-from airl_mav.core.fields import Each, ProfileModel, quantity
+from airl_mav.core.fields import Each, ProfileModel, later_field, quantity
 from airl_mav.profiles.image_file import MOST_IMAGES, ImageFile
 
 TextureName = Literal["plain", "checker", "noise", "brick", "foliage"]
@@ -46,17 +46,7 @@ class Material(ProfileModel):
         le=50,
         default=0.5,
     )
-    image: ImageFile | None = Field(
-        default=None, description="a picture of your own in place of a pattern"
-    )
-
-    @model_serializer(mode="wrap")
-    def _without_unused(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out an image where there is none: the digest is that of before there were."""
-        data: dict[str, Any] = dump(self)
-        if self.image is None:
-            data.pop("image", None)  # gone already where what is None is left out
-        return data
+    image: ImageFile | None = later_field(None, "a picture of your own in place of a pattern")
 
     @model_validator(mode="after")
     def _image_or_pattern(self) -> Material:

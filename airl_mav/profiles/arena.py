@@ -13,9 +13,9 @@ from pydantic import (
     model_validator,
 )
 
-from airl_mav.core.fields import Each, ProfileModel, quantity
+from airl_mav.core.fields import Each, ProfileModel, later_field, quantity
 from airl_mav.core.plugins import GENERATORS, part_name
-from airl_mav.profiles.appearance import DEFAULT, Appearance
+from airl_mav.profiles.appearance import Appearance
 from airl_mav.profiles.assets import ASSETS, Asset
 from airl_mav.profiles.gates import Gates, check_gates
 from airl_mav.profiles.rooms import HEADROOM_M, Rooms, check_rooms
@@ -41,7 +41,7 @@ class Size(ProfileModel):
     north_m: float = quantity("length of the floor, south to north", "m", ge=5, le=500, default=50)
     east_m: float = quantity("width of the floor, west to east", "m", ge=5, le=500, default=50)
     height_m: float = quantity("height of the walls", "m", ge=1, le=50, default=5)
-    ceiling: bool = Field(
+    ceiling: bool = later_field(
         default=False,
         description="whether there is one, at the height of the walls: nothing flies over walls and"
         " gates, the sun does not reach the floor, and the ceiling glows as the sky would",
@@ -82,6 +82,7 @@ class Goal(ProfileModel):
         " always that; left out: it has none, and is reached at any height",
         "m",
         default=None,
+        later=True,
     )
 
     @field_validator("height_m", mode="before")
@@ -199,49 +200,30 @@ class ArenaSpec(ProfileModel):
     moving: MovingObstacles = Field(
         default_factory=MovingObstacles, description="obstacles that move"
     )
-    gates: Gates = Field(
-        default_factory=Gates, description="walls with openings that are on the way to the goal"
-    )
-    rooms: Rooms = Field(
-        default_factory=Rooms, description="walls that divide the arena, with doors between rooms"
-    )
-    terrain: Terrain = Field(default_factory=Terrain, description="hills on the floor")
+    gates: Gates = later_field(Gates, "walls with openings that are on the way to the goal")
+    rooms: Rooms = later_field(Rooms, "walls that divide the arena, with doors between rooms")
+    terrain: Terrain = later_field(Terrain, "hills on the floor")
     assets: dict[str, Asset] = Field(
         default_factory=dict, description="things of your own, made of parts, by name"
     )
     asset_scale: Annotated[tuple[float, float], Each(0.1, 10, ascending=True)] = quantity(
         "factor of all lengths of an asset, drawn for each", "1", default=(1.0, 1.0)
     )
-    appearance: Appearance = Field(
-        default_factory=Appearance, description="what a colour camera sees: materials and light"
+    appearance: Appearance = later_field(
+        Appearance, "what a colour camera sees: materials and light"
     )
 
     @model_serializer(mode="wrap")
     def _without_unused(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out what says nothing: an arena's digest is that of before there was a choice.
-
-        Some of it is gone already where what is None, or as it is by default, is left out.
-        """
+        """Leave out pairs that say nothing, as `later_field` does with what stands alone."""
         data: dict[str, Any] = dump(self)
         silent: list[str] = []
         if self.generator == OBSTACLES and not self.options:
             silent += ["generator", "options"]
-        if self.appearance == DEFAULT:
-            silent.append("appearance")
         if not self.assets and self.asset_scale == (1.0, 1.0):
             silent += ["assets", "asset_scale"]
-        if self.gates == Gates():
-            silent.append("gates")
-        if self.rooms == Rooms():
-            silent.append("rooms")
-        if self.terrain == Terrain():
-            silent.append("terrain")
         for name in silent:
-            data.pop(name, None)
-        if self.goal.height_m is None:
-            data.get("goal", {}).pop("height_m", None)
-        if not self.size.ceiling:
-            data.get("size", {}).pop("ceiling", None)
+            data.pop(name, None)  # gone already where what is as by default is left out
         return data
 
     @property

@@ -8,11 +8,11 @@ common things of their kind, in round numbers.
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
+from pydantic import Field
 
-from airl_mav.core.fields import ProfileModel, quantity
+from airl_mav.core.fields import ProfileModel, later_field, quantity
 from airl_mav.profiles.mesh_file import MeshFile
 
 MOST_PARTS = 128
@@ -98,19 +98,10 @@ class Asset(ProfileModel):
     parts: Annotated[tuple[Part, ...], Field(min_length=1, max_length=MOST_PARTS)] = Field(
         description="boxes, cylinders and spheres, each with its shape, place and size"
     )
-    mesh: MeshFile | None = Field(
-        default=None,
-        description="triangles that cameras see in place of the parts; its material is that of the"
-        " first part",
+    mesh: MeshFile | None = later_field(
+        None,
+        "triangles that cameras see in place of the parts; its material is that of the first part",
     )
-
-    @model_serializer(mode="wrap")
-    def _without_unused(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out a mesh where there is none: the arena's digest is that of before there were."""
-        data: dict[str, Any] = dump(self)
-        if self.mesh is None:
-            data.pop("mesh", None)  # gone already where what is None is left out
-        return data
 
     @property
     def top_m(self) -> float:

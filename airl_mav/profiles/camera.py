@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
-from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import model_validator
 
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.errors import FieldError
-from airl_mav.core.fields import Each, ProfileModel, quantity
+from airl_mav.core.fields import Each, ProfileModel, later_field, quantity
 from airl_mav.profiles.camera_kind import CameraKind
 from airl_mav.profiles.distortion import (
     MOST_COEFFICIENT,
@@ -60,14 +60,14 @@ class Ranging(ProfileModel):
 class Camera(ProfileModel):
     """A camera: the main one looks ahead or all round, further ones wherever they are mounted."""
 
-    kind: CameraKind = Field(
-        default="depth",
-        description="what its pixels are: depth; rgb, sRGB colours of 8 bits a channel; or grey,"
+    kind: CameraKind = later_field(
+        "depth",
+        "what its pixels are: depth; rgb, sRGB colours of 8 bits a channel; or grey,"
         " their luma (ITU-R BT.601)",
     )
-    projection: Projection = Field(
-        default="pinhole",
-        description="pinhole, cylindrical for a field of view of up to 360 deg, or fisheye"
+    projection: Projection = later_field(
+        "pinhole",
+        "pinhole, cylindrical for a field of view of up to 360 deg, or fisheye"
         " (equidistant but for its distortion) of up to 190 deg",
     )
     width_px: int = quantity("image width", "px", ge=8, le=640)
@@ -89,6 +89,7 @@ class Camera(ProfileModel):
         " k4 theta^8), which must increase over the field of view",
         "1",
         default=UNDISTORTED,
+        later=True,
     )
     range_m: float = quantity(
         "farthest depth returned; rgb and grey cameras see without limit", "m", gt=0.5, le=65
@@ -97,7 +98,7 @@ class Camera(ProfileModel):
     forward_m: float = quantity("mount ahead of the centre of mass", "m", ge=-2, le=2)
     up_m: float = quantity("mount above the centre of mass", "m", ge=-2, le=2)
     right_m: float = quantity(
-        "mount to the right of the centre of mass", "m", ge=-2, le=2, default=0.0
+        "mount to the right of the centre of mass", "m", ge=-2, le=2, default=0.0, later=True
     )
     pitch_up_deg: float = quantity("mount angle, positive looks up", "deg", ge=-90, le=90)
     yaw_deg: float = quantity(
@@ -106,20 +107,18 @@ class Camera(ProfileModel):
         ge=-180,
         le=180,
         default=0.0,
+        later=True,
     )
-    stereo: Stereo | None = Field(
-        default=None,
-        description="how depth is matched, of a depth camera with a pinhole; left out: depth"
-        " without error",
+    stereo: Stereo | None = later_field(
+        None,
+        "how depth is matched, of a depth camera with a pinhole; left out: depth without error",
     )
-    ranging: Ranging | None = Field(
-        default=None,
-        description="how a lidar measures depth; left out: without error",
+    ranging: Ranging | None = later_field(
+        None, "how a lidar measures depth; left out: without error"
     )
-    imaging: Imaging | None = Field(
-        default=None,
-        description="how the image of an rgb or grey camera is formed; left out: as the ray caster"
-        " draws it",
+    imaging: Imaging | None = later_field(
+        None,
+        "how the image of an rgb or grey camera is formed; left out: as the ray caster draws it",
     )
 
     @model_validator(mode="after")
@@ -135,27 +134,6 @@ class Camera(ProfileModel):
             )
         check_matched("camera.kind", self)
         return self
-
-    @model_serializer(mode="wrap")
-    def _without_the_default(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        # Profiles that say nothing of what came later keep their digests.
-        data: dict[str, Any] = dump(self)
-        if self.kind == "depth":
-            data.pop("kind", None)
-        if self.projection == "pinhole":
-            data.pop("projection", None)
-        if self.distortion == UNDISTORTED:
-            data.pop("distortion", None)
-        for name in ("right_m", "yaw_deg"):
-            if getattr(self, name) == 0.0:
-                data.pop(name, None)
-        if self.stereo is None:
-            data.pop("stereo", None)
-        if self.ranging is None:
-            data.pop("ranging", None)
-        if self.imaging is None:
-            data.pop("imaging", None)
-        return data
 
     @property
     def period_us(self) -> int:

@@ -8,15 +8,15 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import tomli_w
-from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import Field, model_validator
 
 from airl_mav.core.constants import G_PER_KG
 from airl_mav.core.errors import UsageError
-from airl_mav.core.fields import ProfileModel, quantity
+from airl_mav.core.fields import ProfileModel, later_field, quantity
 from airl_mav.core.files import replace_file
 from airl_mav.profiles.loading import load_profile, profiles_dir
 
@@ -130,8 +130,8 @@ class Workload(ProfileModel):
     latency: Latency
     source: str = Field(description="where the latency comes from")
     assumed: str = Field(default="", description="what the source does not give and we assume")
-    measured: Measured | None = Field(
-        default=None, description="how it was timed, in a profile that airl profile --share wrote"
+    measured: Measured | None = later_field(
+        None, "how it was timed, in a profile that airl profile --share wrote"
     )
 
     @model_validator(mode="after")
@@ -144,14 +144,6 @@ class Workload(ProfileModel):
         if samples_digest(samples_ms) != self.measured.samples_sha256:
             raise ValueError("measured.samples_sha256: is not that of latency.samples_ms")
         return self
-
-    @model_serializer(mode="wrap")
-    def _without_the_default(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        # Profiles that do not tell keep their digests.
-        data: dict[str, Any] = dump(self)
-        if self.measured is None:
-            data.pop("measured", None)
-        return data
 
     @property
     def origin(self) -> Origin:

@@ -6,15 +6,13 @@ from typing import Annotated, Any, Literal
 
 from pydantic import (
     Field,
-    SerializerFunctionWrapHandler,
     Strict,
-    model_serializer,
     model_validator,
 )
 
 from airl_mav.core.constants import C_PER_MAH, GRAVITY_M_S2
 from airl_mav.core.errors import FieldError, UsageError
-from airl_mav.core.fields import ProfileModel, quantity
+from airl_mav.core.fields import ProfileModel, later_field, quantity
 from airl_mav.core.frames import Geodetic
 from airl_mav.core.location import HOME
 from airl_mav.profiles.camera import Camera
@@ -255,9 +253,9 @@ class VehicleProfile(ProfileModel):
     battery: Battery
     power: Momentum | Regression = Field(discriminator="model", description="power model")
     camera: Camera
-    cameras: FurtherCameras = Field(
-        default_factory=dict,
-        description="further cameras by name, each a table as `camera`, triggered with that one:"
+    cameras: FurtherCameras = later_field(
+        dict,
+        "further cameras by name, each a table as `camera`, triggered with that one:"
         " their rate_hz is left out",
     )
     sensors: Sensors
@@ -280,14 +278,6 @@ class VehicleProfile(ProfileModel):
     @classmethod
     def _triggered_together(cls, data: Any) -> Any:
         return with_the_rate(data)
-
-    @model_serializer(mode="wrap")
-    def _without_unused(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        # Profiles of one camera keep their digests.
-        data: dict[str, Any] = dump(self)
-        if not self.cameras:
-            data.pop("cameras", None)
-        return data
 
     @model_validator(mode="after")
     def _one_rate(self) -> VehicleProfile:

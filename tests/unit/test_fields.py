@@ -10,7 +10,14 @@ import pytest
 from pydantic import Field, ValidationError
 
 from airl_mav.core.errors import FieldError, UsageError, shown
-from airl_mav.core.fields import ProfileModel, field_error, quantity, range_of, validated
+from airl_mav.core.fields import (
+    ProfileModel,
+    field_error,
+    later_field,
+    quantity,
+    range_of,
+    validated,
+)
 
 
 class Inner(ProfileModel):
@@ -25,6 +32,12 @@ class Outer(ProfileModel):
     inner: Inner = Field(default_factory=Inner)
     speed: Annotated[float, Field(gt=0, le=100)] | Literal["max"] = 1.0
     places: tuple[float, float] = (0.0, 0.0)
+
+
+class Grown(Inner):
+    kind: str = later_field("plain", "a kind")
+    inner: Inner = later_field(Inner, "a table")
+    turn_deg: float = quantity("a turn", "deg", ge=-180, le=180, default=0.0, later=True)
 
 
 @pytest.mark.parametrize(
@@ -74,6 +87,14 @@ def test_optional_numbers_take_none_and_whole_numbers() -> None:
     assert Inner(limit_s=None).limit_s is None
     assert Inner.model_validate({"limit_s": 3}).limit_s == 3.0
     assert range_of(Inner.model_fields["limit_s"]) == "0 < value <= 2147483648 s"
+
+
+def test_fields_that_came_later_leave_dumps_as_they_were() -> None:
+    assert Grown().model_dump_json() == Inner().model_dump_json()
+    asked: dict[str, Any] = {"kind": "plain", "inner": {"share": 0.5}, "turn_deg": 0}
+    assert Grown.model_validate(asked).model_dump() == Inner().model_dump()
+    changed = Grown(kind="round", inner=Inner(share=0.25), turn_deg=1.0)
+    assert Grown.model_validate_json(changed.model_dump_json()) == changed
 
 
 def test_shown_values_are_short() -> None:
