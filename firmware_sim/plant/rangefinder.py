@@ -1,36 +1,23 @@
-"""The rangefinder: one ray straight down in body axes, against what cameras see of the arena."""
+"""The rangefinder: one ray straight down in body axes, with noise and limits."""
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
-from airl_mav.arena.geometry import Arena, Bounds
-from airl_mav.camera.bvh import meshes_of
-from airl_mav.camera.raycast import render_depth
-from airl_mav.camera.render import Mount, camera_pose
+from airl_mav.arena.geometry import Arena
 from airl_mav.core.frames import Vector
 from airl_mav.profiles.sensors import Rangefinder
 from firmware_sim.interfaces import DistanceReading
+from firmware_sim.plant.downward_ray import DownwardRay
 from firmware_sim.plant.kinematics import POSITION, QUATERNION
-from firmware_sim.plant.sensors import BLOCK, Rate
+from firmware_sim.plant.sensors import Rate, White
 
 VALID, INVALID = 100, 0
 """Quality of a range within the limits, and of any other [%]."""
 
-_DOWN = -0.5 * math.pi
-"""Angle of the ray above the body's forward axis [rad]."""
-
-_FOCAL_PX = 1_000.0
-"""Of an image of one pixel: so narrow that next to nothing but the ray is looked at."""
-
-_ENDLESS = Bounds(-1e6, 1e6, -1e6, 1e6, 1.0)
-"""The floor where there is no arena."""
-
 
 class PlantRangefinder:
-    """Measures the distance to ground, walls and obstacles, moving ones and meshes among them."""
+    """Measures the distance to what lies below."""
 
     def __init__(
         self, profile: Rangefinder, arena: Arena | None, rng: np.random.Generator, times: float
@@ -44,31 +31,18 @@ class PlantRangefinder:
             times: What its noise is multiplied by; what it says of its variance stays.
         """
         self.rate = Rate(profile.rate_hz)
-        self._profile, self._arena, self._rng = profile, arena, rng
+        self._profile = profile
         self._sigma = times * profile.noise_m
-        self._white = np.zeros(0)
-        self._next = 0
-        self._mount = Mount((profile.forward_m, profile.right_m, profile.down_m), _DOWN)
-        self._image = np.empty((1, 1), np.float32)
-        bounds = _ENDLESS if arena is None else arena.bounds
-        self._bounds = bounds.as_array()
-        if arena is None:
-            self._shapes = np.zeros(0, np.int8), np.zeros((0, 3)), np.zeros(0)
-            self._still = np.zeros((0, 3))
-            self._meshes = None
-        else:
-            bodies = arena.obstacles
-            self._shapes = bodies.shape, bodies.half_size, bodies.yaw
-            self._still = bodies.center
-            self._meshes = meshes_of(arena.meshes, len(bodies), arena.ground)
-        # The first ray loads or compiles the kernels: better here than in flight.
-        self.range_m(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), 0)
+        self._white = White(rng, 1)
+        place = (profile.forward_m, profile.right_m, profile.down_m)
+        self.ray = DownwardRay(place, profile.greatest_m, arena)
+        """What it measures along."""
 
     def read(self, row: Vector, elapsed_us: int) -> DistanceReading:
         """Return what is measured in a motion (16,), so long after obstacles set out [µs]."""
         profile = self._profile
-        true = self.range_m(row[POSITION], row[QUATERNION], elapsed_us)
-        white = self._draw()
+        true = self.ray.length_m(row[POSITION], row[QUATERNION], elapsed_us)
+        white = self._white.draw().item()
         least, greatest = profile.least_m, profile.greatest_m
         # Nothing comes back: such sensors tell their end of the scale, as invalid.
         told = greatest if true is None else max(0.0, true + self._sigma * white)
@@ -76,43 +50,3 @@ class PlantRangefinder:
         return DistanceReading(
             told, least, greatest, profile.noise_m**2, VALID if good else INVALID
         )
-
-    def range_m(self, position: Vector, quaternion: Vector, elapsed_us: int) -> float | None:
-        """Return the true distance [m]; None: nothing is within the greatest range.
-
-        Args:
-            position: (3,) of the vehicle, NED [m].
-            quaternion: (4,) body -> NED.
-            elapsed_us: Time since moving obstacles set out [µs].
-        """
-        arena, centers = self._arena, self._still
-        if arena is not None and arena.tours:
-            centers = arena.centers_at(elapsed_us)
-        at, attitude = camera_pose(position, quaternion, self._mount)
-        shape, half_size, yaw = self._shapes
-        render_depth(
-            self._image,
-            at,
-            attitude,
-            _FOCAL_PX,
-            0.0,
-            0.0,
-            False,
-            self._profile.greatest_m,
-            self._bounds,
-            shape,
-            centers,
-            half_size,
-            yaw,
-            self._meshes,
-            None,
-        )
-        depth = self._image.item()
-        return depth if depth > 0.0 else None
-
-    def _draw(self) -> float:
-        if self._next == len(self._white):
-            self._white, self._next = self._rng.standard_normal(BLOCK), 0
-        self._next += 1
-        white: float = self._white.item(self._next - 1)
-        return white

@@ -56,7 +56,7 @@ class Rate:
         return period * US_PER_S / self._rate_hz
 
 
-class _White:
+class White:
     """White noise of one sensor, standard deviation 1."""
 
     def __init__(self, rng: np.random.Generator, width: int) -> None:
@@ -117,7 +117,7 @@ class _Compass:
     def __init__(self, magnetometer: Magnetometer, rng: np.random.Generator, times: float) -> None:
         self.rate = Rate(magnetometer.rate_hz)
         self._sigma = times * magnetometer.noise_gauss
-        self._white = _White(rng, 3)
+        self._white = White(rng, 3)
 
     def read(self, row: Vector) -> Vector:
         """Return the field FRD [gauss]."""
@@ -134,7 +134,7 @@ class _Barometer:
         self._noise_pa = times * barometer.noise_pa
         self._step_pa = times * barometer.drift_pa_sqrt_s / math.sqrt(barometer.rate_hz)
         self._drift_pa = 0.0
-        self._white = _White(rng, 2)
+        self._white = White(rng, 2)
 
     def read(self, altitude: float) -> float:
         """Return the static pressure [hPa] at an altitude above mean sea level [m]."""
@@ -157,7 +157,7 @@ class _Gps:
         noise = (gps.horizontal_noise_m, gps.horizontal_noise_m, gps.vertical_noise_m)
         self._position_noise = times * np.array(noise)
         self._velocity_noise = times * gps.velocity_noise_m_s
-        self._white = _White(rng, 9)
+        self._white = White(rng, 9)
 
     def read(self, row: Vector) -> GpsFix:
         """Return a fix."""
@@ -179,7 +179,7 @@ class _Vision:
     def __init__(self, vision: Vision, rng: np.random.Generator, times: float) -> None:
         self.rate = Rate(vision.rate_hz)
         self._vision, self._times = vision, times
-        self._white = _White(rng, 13)
+        self._white = White(rng, 13)
         self._start: tuple[Vector, Vector] | None = None
         """Position, and attitude of the frame, at the first pose."""
         self._last = np.zeros(3)
@@ -275,7 +275,7 @@ class SensorSuite:
         )
         self._accel_bias = times * imu.accel_bias_m_s2 * inertial.standard_normal(3)
         self._gyro_bias = times * imu.gyro_bias_rad_s * inertial.standard_normal(3)
-        self._white = _White(inertial, 12)
+        self._white = White(inertial, 12)
         self._compass = _Compass(profile.magnetometer, compass, times)
         self._barometer = _Barometer(profile.barometer, barometer, times)
         self._gps = _Gps(profile.gps, gps, times) if profile.gps.fitted else None

@@ -244,7 +244,7 @@ def test_a_rangefinder_sees_hills_as_pybullet_s_rays_do() -> None:
         turn = attitude(rng, 0.2)
         height = touching_height(north, east, turn) + rng.uniform(0.0, 5.0)
         at = np.array([north, east, -height])
-        told = finder.range_m(at, np.array(wxyz(turn)), 0)
+        told = finder.ray.length_m(at, np.array(wxyz(turn)), 0)
         begin = at + turn.apply(offset)
         end = begin + QUIET.greatest_m * turn.apply([0.0, 0.0, 1.0])
         (hit,) = world.client.rayTestBatch(
@@ -268,7 +268,7 @@ def test_a_rangefinder_on_a_slope_reads_its_height_above_it() -> None:
                 plant.put((north, east, -start - 0.01))
                 for _ in range(400):
                     plant.step(OFF)
-                told = finder.range_m(plant.motion[:3], plant.motion[6:10], 0)
+                told = finder.ray.length_m(plant.motion[:3], plant.motion[6:10], 0)
                 assert told is not None
                 assert told < HEIGHT + 0.05
 

@@ -69,7 +69,7 @@ def test_rays_are_pybullet_s(name: str) -> None:
                 ned_to_enu(start + 30.0 * down).tolist(),
                 physicsClientId=world.number,
             )
-            found = mine.range_m(position, row_at(position, attitude)[QUATERNION], 0)
+            found = mine.ray.length_m(position, row_at(position, attitude)[QUATERNION], 0)
             if share == 0.0 or (found is not None and found < 2.0 * MIN_DEPTH_M):
                 continue  # it began inside of something
             true = 30.0 * share
