@@ -82,6 +82,23 @@ class DistanceReading(NamedTuple):
     """MAV_DISTANCE_SENSOR: 0 = laser."""
 
 
+class FlowReading(NamedTuple):
+    """How the ground below has moved in an image since the reading before, as OPTICAL_FLOW_RAD.
+
+    A turn of the vehicle about an axis is a positive flow about it, and so is a motion forward
+    about y; a motion to the right is a negative flow about x.
+    """
+
+    flow: Vector
+    """(2,) about the body's x and y axes [rad]."""
+    interval_s: float
+    """How long it took; 0 = nothing was measured."""
+    quality: int
+    """0 = invalid to 255 = best."""
+    turned: Vector
+    """(3,) how far its own gyro has turned meanwhile, FRD [rad]; NaN = it has none."""
+
+
 class BatterySample(NamedTuple):
     """What a power module reports."""
 
@@ -111,6 +128,8 @@ class SensorSample(NamedTuple):
     """Of external vision that is part of the vehicle."""
     distance: DistanceReading | None = None
     """Of a rangefinder that is part of the vehicle."""
+    flow: FlowReading | None = None
+    """Of an optical flow sensor that is part of the vehicle."""
 
 
 class ActuatorControls(NamedTuple):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import Field, model_validator
 from typing_extensions import Self
 
-from airl_mav.core.fields import ProfileModel, quantity
+from airl_mav.core.fields import ProfileModel, later_field, quantity
 
 
 class Imu(ProfileModel):
@@ -87,6 +87,31 @@ class Rangefinder(ProfileModel):
         return self
 
 
+class OpticalFlow(ProfileModel):
+    """A camera that looks straight down in body axes, and tells how the ground moves in its image.
+
+    Out of its limits, and where nothing is below, it tells a quality of 0. It has no gyro: the
+    flight controller takes its own.
+    """
+
+    rate_hz: float = quantity("measurements a second", "Hz", ge=5, le=125)
+    least_m: float = quantity("least distance of the ground that it sees sharply", "m", ge=0, le=5)
+    greatest_m: float = quantity("greatest distance at which it sees texture", "m", gt=0.1, le=300)
+    greatest_rad_s: float = quantity("fastest flow that it measures", "rad/s", ge=0.1, le=100)
+    noise_rad_s: float = quantity("white noise of each axis, sd", "rad/s", ge=0, le=10)
+    forward_m: float = quantity("its place ahead of the centre", "m", default=0.0, ge=-2, le=2)
+    right_m: float = quantity("its place to the right of the centre", "m", default=0.0, ge=-2, le=2)
+    down_m: float = quantity("its place below the centre", "m", default=0.0, ge=-2, le=2)
+
+    @model_validator(mode="after")
+    def _sees(self) -> Self:
+        if self.greatest_m <= self.least_m:
+            raise ValueError(
+                f"greatest_m = {self.greatest_m:g}: accepted: more than least_m = {self.least_m:g}"
+            )
+        return self
+
+
 class Sensors(ProfileModel):
     """The sensor suite."""
 
@@ -99,4 +124,7 @@ class Sensors(ProfileModel):
     )
     rangefinder: Rangefinder | None = Field(
         default=None, description="what measures how far the ground is; absent = nothing does"
+    )
+    optical_flow: OpticalFlow | None = later_field(
+        None, "what measures how the ground moves below; absent = nothing does"
     )

@@ -29,6 +29,7 @@ from firmware_sim.plant.dynamics import (
     supply,
 )
 from firmware_sim.plant.kinematics import POSITION, QUATERNION, RATES, VELOCITY
+from firmware_sim.plant.optical_flow import PlantOpticalFlow
 from firmware_sim.plant.rangefinder import PlantRangefinder
 from firmware_sim.plant.sensors import SensorSuite
 
@@ -97,6 +98,10 @@ class Plant:
         if fitted is not None:
             # A further child: the streams of the other sensors stay what they are.
             self._rangefinder = PlantRangefinder(fitted, arena, noise.spawn(1)[0], times)
+        flow = profile.sensors.optical_flow
+        self._flow = None
+        if flow is not None:
+            self._flow = PlantOpticalFlow(flow, arena, noise.spawn(1)[0], times, tick_s)
         self._start_us = start_us
         self._moves_us = start_us
         """When moving obstacles set out."""
@@ -179,11 +184,15 @@ class Plant:
     def sense(self) -> SensorSample:
         """Return a sensor sample of the present state."""
         sample = self._sensors.sample(self.time_us, self.motion, self._battery)
-        finder = self._rangefinder
-        if finder is None or not finder.rate.due(self.time_us):
-            return sample
+        finder, flow = self._rangefinder, self._flow
         elapsed_us = self.time_us - self._moves_us
-        return sample._replace(distance=finder.read(self.motion, elapsed_us))
+        if finder is not None and finder.rate.due(self.time_us):
+            sample = sample._replace(distance=finder.read(self.motion, elapsed_us))
+        if flow is not None:
+            flow.pass_tick(self.motion)
+            if flow.rate.due(self.time_us):
+                sample = sample._replace(flow=flow.read(self.motion, elapsed_us))
+        return sample
 
     def truth(self) -> Truth:
         """Return the true state."""
