@@ -83,6 +83,9 @@ FITTED_CASES: tuple[Case, ...] = (
     Case("rangefinder stuck", STANDS, frozenset({"not armed", "landed", "flying"})),
     Case("rangefinder noise 5x"),
     Case("rangefinder bias 0.5m"),
+    Case("flow off"),
+    Case("flow stuck"),
+    Case("flow noise 5x"),
 )
 """Of sensors that not every vehicle has: in no matrix but one that asks for them."""
 

@@ -21,6 +21,7 @@ Part = Literal[
     "gps",
     "vision",
     "rangefinder",
+    "flow",
     "motor1",
     "motor2",
     "motor3",
@@ -41,7 +42,10 @@ Part = Literal[
 Phase = Literal["ground", "climb", "hold", "offboard", "mission", "return", "landing"]
 """Phases of a flight that can set a fault off, by what the flight controller flies."""
 
-SENSORS: tuple[Part, ...] = ("accel", "gyro", "mag", "baro", "gps", "vision", "rangefinder")
+SENSORS: tuple[Part, ...] = (
+    *("accel", "gyro", "mag", "baro", "gps"),
+    *("vision", "rangefinder", "flow"),
+)
 MOTORS: tuple[Part, ...] = ("motor1", "motor2", "motor3", "motor4")
 LINKS: tuple[Part, ...] = ("link", "uplink", "downlink")
 PROCESSES: tuple[Part, ...] = ("companion", "firmware")
@@ -144,6 +148,14 @@ _SENSORS: Mapping[Part, _Sensor] = {
         width=1,
         off="it tells no ranges any more",
         bias_meaning="is added to the range",
+    ),
+    "flow": _Sensor(
+        "rad/s",
+        35.0,
+        {"rad/s": 1.0, "deg/s": math.pi / 180.0},
+        width=2,
+        off="it tells no optical flow any more",
+        bias_meaning="is added to the flow about x and y",
     ),
 }
 

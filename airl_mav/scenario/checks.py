@@ -75,6 +75,7 @@ def check_fitted(sensors: Sensors, faults: Sequence[Fault]) -> None:
     """Raise FieldError for a fault of a sensor that the vehicle does not have."""
     fitted = {"gps": sensors.gps.fitted, "vision": sensors.vision is not None}
     fitted["rangefinder"] = sensors.rangefinder is not None
+    fitted["flow"] = sensors.optical_flow is not None
     for fault in faults:
         if not fitted.get(fault.part, True):
             raise FieldError("faults", str(fault), f"with a vehicle that has {fault.part}")

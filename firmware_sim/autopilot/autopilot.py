@@ -55,7 +55,14 @@ from firmware_sim.autopilot.requests import (
     Request,
 )
 from firmware_sim.autopilot.snapshot import Parts, Snapshot
-from firmware_sim.interfaces import ActuatorControls, DistanceReading, Odometry, SensorSample, Truth
+from firmware_sim.interfaces import (
+    ActuatorControls,
+    DistanceReading,
+    FlowReading,
+    Odometry,
+    SensorSample,
+    Truth,
+)
 
 _STILL: Motors = (0.0, 0.0, 0.0, 0.0)
 
@@ -420,6 +427,10 @@ class BuiltinAutopilot:
         """Hand over what a client's distance sensor measures."""
         self.estimator.measure(reading, CLIENTS_SENSOR)
         self._snapshot = None
+
+    def look_down(self, reading: FlowReading) -> None:
+        """Hand over what a client's optical flow sensor measures."""
+        self.estimator.look_down(reading)
 
     def see_obstacles(self, obstacles: Obstacles) -> None:
         """Hand over how far obstacles are."""

@@ -16,7 +16,13 @@ from numpy.typing import NDArray
 from airl_mav.core.frames import Geodetic
 from firmware_sim.autopilot.events.definition import Definition, Event
 from firmware_sim.autopilot.manual_control import Sticks
-from firmware_sim.interfaces import BatterySample, DistanceReading, GpsFix, Odometry
+from firmware_sim.interfaces import (
+    BatterySample,
+    DistanceReading,
+    FlowReading,
+    GpsFix,
+    Odometry,
+)
 
 Vector = NDArray[np.float64]
 
@@ -432,6 +438,16 @@ class AutopilotState(Protocol):
 
     @property
     def distance_us(self) -> int:
+        """When it came [µs]."""
+        ...
+
+    @property
+    def flow(self) -> FlowReading | None:
+        """The newest of an optical flow sensor; None before any."""
+        ...
+
+    @property
+    def flow_us(self) -> int:
         """When it came [µs]."""
         ...
 

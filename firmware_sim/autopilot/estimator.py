@@ -30,11 +30,18 @@ from firmware_sim.autopilot.filter_kernel import KernelFilter
 from firmware_sim.autopilot.fusion_horizon import FusionHorizon
 from firmware_sim.autopilot.magnetic_field import FieldCheck
 from firmware_sim.autopilot.measurement import Measurement, selecting
+from firmware_sim.autopilot.optical_flow import OpticalFlow
 from firmware_sim.autopilot.range_finder import Aids, RangeFinder
 from firmware_sim.autopilot.recovery import Moment, Recovery
 from firmware_sim.autopilot.terrain_filter import TerrainFilter
 from firmware_sim.autopilot.yaw_estimator import YawEstimator
-from firmware_sim.interfaces import DistanceReading, GpsFix, Odometry, SensorSample
+from firmware_sim.interfaces import (
+    DistanceReading,
+    FlowReading,
+    GpsFix,
+    Odometry,
+    SensorSample,
+)
 
 _north, _east, _down = MAGNETIC_FIELD_NED
 # The field dips, so a tilt error turns the measured heading: seen from the world's axes,
@@ -108,6 +115,7 @@ class Estimator:
         """What is done about inertial sensors and a heading that have gone wrong."""
         self.vision = ExternalVision(value, self.state, self.filter, self._fuse, self._judge)
         """What something else has estimated of the vehicle's pose."""
+        self._horizons = [self._horizon, self.vision.horizon]
         self.flying = False
         """Whether the vehicle is in the air; set by whoever knows."""
         self.odometry: Odometry | None = None
@@ -115,7 +123,9 @@ class Estimator:
         self.odometry_us = 0
         """When it was told [µs]."""
         self.range: RangeFinder | None = None
-        """What tells how far the ground is below; None before the first range."""
+        """What tells how far the ground is below; None before the first range, or flow."""
+        self.flow: OpticalFlow | None = None
+        """What tells how the ground moves below; None before the first flow."""
         self._field: Vector | None = None
         """The newest that the compass has measured (3,) FRD [gauss]; before alignment the mean."""
 
@@ -142,6 +152,12 @@ class Estimator:
                 self.measure(sample.distance)
             if self.range is not None:
                 self.range.step(sample.time_us, self._aids, flying=self.flying)
+            if self.flow is not None:
+                self.flow.turn(sample.gyro)
+            if sample.flow is not None:
+                self.look_down(sample.flow)
+            if self.flow is not None:
+                self.flow.step(sample.time_us, aided=self._aided, flying=self.flying)
         converged = es.converged(self.state, self.filter.covariance)
         self.healthy = converged and self._aligned_us is not None
 
@@ -155,17 +171,28 @@ class Estimator:
 
     def measure(self, reading: DistanceReading, source: int = 0) -> None:
         """Take what a distance sensor measures now; 0 = the vehicle's own, else a client's."""
+        if self._aligned_us is not None:
+            self._know_ground().take(reading, self._time_us, source)
+
+    def look_down(self, reading: FlowReading) -> None:
+        """Take what an optical flow sensor measures now."""
         if self._aligned_us is None:
             return
+        if self.flow is None:
+            self.flow = OpticalFlow(self._value, self.state, self._know_ground(), self._fuse)
+            self._horizons.append(self.flow.horizon)
+        self.flow.take(reading, self._time_us)
+
+    def _know_ground(self) -> RangeFinder:
+        """Return what knows the ground; from the first call on the filter does, too."""
         if self.range is None:
-            # From the first on the filter knows the ground, too.
             terrain = TerrainFilter(self.filter)
             self.filter = terrain
             self.recovery.use(terrain)
             self.vision.use(terrain)
             self.range = RangeFinder(self._value, self.state, terrain, self._time_us)
             self.vision.on_height_moved = self.range.moved
-        self.range.take(reading, self._time_us, source)
+        return self.range
 
     def estimate(self) -> Estimate:
         """Return a copy of the estimate after the newest tick."""
@@ -216,10 +243,15 @@ class Estimator:
         longest_us = self._value("EKF2_NOAID_TOUT") if flying else GPS_GONE_US
         if self._aligned_us is None:
             return False
-        vision = self.vision
-        return self._recent(self._gps_horizontal, now_us, longest_us) or any(
-            m.fused_us is not None and now_us - m.fused_us <= longest_us
-            for m in (vision.position, vision.velocity)
+        vision, flow = self.vision, self.flow
+        return (
+            self._recent(self._gps_horizontal, now_us, longest_us)
+            or any(
+                m.fused_us is not None and now_us - m.fused_us <= longest_us
+                for m in (vision.position, vision.velocity)
+            )
+            or (flow is not None and flow.told_motion_since(now_us - longest_us))
+            or (flow is not None and not flying and flow.is_coming(now_us))
         )
 
     def knows_height(self, now_us: int) -> bool:
@@ -238,10 +270,16 @@ class Estimator:
         gps, seen = self._uses_gps and self.fuses_gps(self._time_us), self.vision.fused
         told = (self._baro, self._gps_vertical, self.vision.height)
         return Aids(
-            horizontal=gps or bool(seen & (Control.HORIZONTAL | Control.VELOCITY)),
+            horizontal=self._aided or (self.flow is not None and self.flow.fused),
             vertical_speed=gps or bool(seen & Control.VELOCITY),
             height_us=max(m.fused_us or 0 for m in told),
         )
+
+    @property
+    def _aided(self) -> bool:
+        """Whether anything but optical flow measures horizontal motion."""
+        seen = self.vision.fused & (Control.HORIZONTAL | Control.VELOCITY)
+        return bool(seen) or (self._uses_gps and self.fuses_gps(self._time_us))
 
     @property
     def aligned(self) -> bool:
@@ -308,11 +346,12 @@ class Estimator:
         return q
 
     def _predict(self, sample: SensorSample) -> None:
-        state, horizon, seen = self.state, self._horizon, self.vision.horizon
-        before = state[es.P : es.Q].copy() if horizon.is_past or seen.is_past else None
+        state = self.state
+        past = [each for each in self._horizons if each.is_past]
+        before = state[es.P : es.Q].copy() if past else None
         self.filter.predict(state, sample.gyro, sample.accel)
         if before is not None:
-            for each in (horizon, seen):
+            for each in past:
                 each.moved(before, state[es.P : es.Q])
 
     # --- measurements

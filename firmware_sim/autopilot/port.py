@@ -15,7 +15,7 @@ from firmware_sim.autopilot.events.definition import Event
 from firmware_sim.autopilot.manual_control import Source, Sticks
 from firmware_sim.autopilot.navigation.plan import Plans
 from firmware_sim.autopilot.requests import FollowedTarget, LandingTarget, Obstacles, Request
-from firmware_sim.interfaces import DistanceReading, Odometry, SensorSample
+from firmware_sim.interfaces import DistanceReading, FlowReading, Odometry, SensorSample
 
 
 @dataclass(frozen=True, slots=True)
@@ -255,6 +255,10 @@ class AutopilotPort(Protocol):
 
     def measure_distance(self, reading: DistanceReading) -> None:
         """Hand over what a client's distance sensor measures, received now."""
+        ...
+
+    def look_down(self, reading: FlowReading) -> None:
+        """Hand over what a client's optical flow sensor measures, received now."""
         ...
 
     def see_obstacles(self, obstacles: Obstacles) -> None:

@@ -95,7 +95,9 @@ class RangeFinder:
         self._filtered_ratio = 0.0
         self._tested_us = 0
         self._ground_us: int | None = None
-        """When ranges last said where the ground is."""
+        """When ranges, or something else, last said where the ground is."""
+        self._seen_us: int | None = None
+        """When something else than ranges did; None = never."""
         self._valid = False
         self._resets = 0
         self._flying = False
@@ -166,6 +168,10 @@ class RangeFinder:
         """Note that all heights are counted from elsewhere: down is this much more [m]."""
         self.terrain.down += down_m
         self._resets += 1
+
+    def ground_seen(self, now_us: int) -> None:
+        """Note that something else than a range has told the filter where the ground is."""
+        self._ground_us = self._seen_us = now_us
 
     def told_height_since(self, since_us: float) -> bool:
         """Return whether a range has told how high the vehicle is since then [µs]."""
@@ -394,6 +400,6 @@ class RangeFinder:
         if self._valid:
             self._valid = possible and spread < max(0.1 * clearance, 0.5) ** 2
         else:
-            fused = self.fused_us
-            recent = fused is not None and now_us - fused <= TIMEOUT_US
-            self._valid = possible and self.tells_ground and recent
+            times = (self.fused_us if self.tells_ground else None, self._seen_us)
+            recent = any(time is not None and now_us - time <= TIMEOUT_US for time in times)
+            self._valid = possible and recent

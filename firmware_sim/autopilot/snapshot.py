@@ -36,7 +36,14 @@ from firmware_sim.autopilot.navigation.navigator import Navigator
 from firmware_sim.autopilot.navigation.plan import Plans
 from firmware_sim.autopilot.navigation.progress import progress
 from firmware_sim.autopilot.newest_sensors import NewestSensors
-from firmware_sim.interfaces import BatterySample, DistanceReading, GpsFix, Odometry, SensorSample
+from firmware_sim.interfaces import (
+    BatterySample,
+    DistanceReading,
+    FlowReading,
+    GpsFix,
+    Odometry,
+    SensorSample,
+)
 
 
 class Parts(NamedTuple):
@@ -206,6 +213,16 @@ class Snapshot:
     def distance_us(self) -> int:
         finder = self._parts.estimator.range
         return 0 if finder is None else finder.reading_us
+
+    @property
+    def flow(self) -> FlowReading | None:
+        flow = self._parts.estimator.flow
+        return None if flow is None else flow.reading
+
+    @property
+    def flow_us(self) -> int:
+        flow = self._parts.estimator.flow
+        return 0 if flow is None else flow.reading_us
 
     @property
     def clearance(self) -> Clearance | None:

@@ -26,11 +26,11 @@ SIMULATED_MS = 5.0
 """EKF2_RNG_DELAY by default: what a range takes on its way through PX4's simulators. Here it takes
 nothing, so that only what is assumed beyond it counts [ms]."""
 
-_GROUND = es.N_STATES
+GROUND = es.N_STATES
 """Index of the ground among 17 states."""
 
 _OF_RANGE = np.zeros(es.N_STATES + 1)
-_OF_RANGE[es.POS + 2], _OF_RANGE[_GROUND] = -1.0, 1.0
+_OF_RANGE[es.POS + 2], _OF_RANGE[GROUND] = -1.0, 1.0
 _OF_RANGE.setflags(write=False)
 """How the height above ground depends on the errors: the ground's z less the vehicle's."""
 
@@ -134,25 +134,56 @@ class TerrainFilter:
             height: Whether it says how high the vehicle is.
             ground: Whether it says where the ground is.
         """
-        p = np.empty((es.N_STATES + 1, es.N_STATES + 1))
-        p[:_GROUND, :_GROUND] = self._inner.covariance
-        p[:_GROUND, _GROUND] = p[_GROUND, :_GROUND] = self.cross
-        p[_GROUND, _GROUND] = self.variance
-        spread = p @ _OF_RANGE
-        gain = spread / (float(_OF_RANGE @ spread) + variance)
+        self.fuse_with_ground(state, innovation, _OF_RANGE, variance, vehicle=height, ground=ground)
+
+    def fuse_with_ground(
+        self,
+        state: Vector,
+        innovation: float,
+        row: Vector,
+        variance: float,
+        *,
+        vehicle: bool,
+        ground: bool,
+    ) -> None:
+        """Correct by a measurement that the ground has a part in; there is no gate.
+
+        Args:
+            state: Nominal state, updated.
+            innovation: Measured less expected.
+            row: How it changes by the 16 errors and the ground (17,).
+            variance: Of the measurement.
+            vehicle: Whether it tells of the vehicle.
+            ground: Whether it says where the ground is.
+        """
+        p = self._joint()
+        spread = p @ row
+        gain = spread / (float(row @ spread) + variance)
         if not ground:
-            gain[_GROUND] = 0.0
-        if not height:
-            gain[:_GROUND] = 0.0
+            gain[GROUND] = 0.0
+        if not vehicle:
+            gain[:GROUND] = 0.0
         # Joseph's form: right for any gain.
         p -= np.outer(gain, spread)
-        p += np.outer(gain * variance - p @ _OF_RANGE, gain)
+        p += np.outer(gain * variance - p @ row, gain)
         p = 0.5 * (p + p.T)
-        self.down += gain.item(_GROUND) * innovation
-        self.variance, self.cross = float(p[_GROUND, _GROUND]), p[:_GROUND, _GROUND].copy()
-        if height:
-            self._inner.restart(p[:_GROUND, :_GROUND])
-            es.inject(state, gain[:_GROUND] * innovation)
+        self.down += gain.item(GROUND) * innovation
+        self.variance, self.cross = float(p[GROUND, GROUND]), p[:GROUND, GROUND].copy()
+        if vehicle:
+            self._inner.restart(p[:GROUND, :GROUND])
+            es.inject(state, gain[:GROUND] * innovation)
+
+    def spread(self, row: Vector) -> float:
+        """Return the variance that errors and ground give a measurement, by its Jacobian (17,)."""
+        return float(row @ self._joint() @ row)
+
+    def _joint(self) -> Vector:
+        """Return the covariance of the errors and the ground (17, 17)."""
+        p = np.empty((es.N_STATES + 1, es.N_STATES + 1))
+        p[:GROUND, :GROUND] = self._inner.covariance
+        p[:GROUND, GROUND] = p[GROUND, :GROUND] = self.cross
+        p[GROUND, GROUND] = self.variance
+        return p
 
     def put_by_range(self, innovation: float, variance: float) -> None:
         """Put the ground where a height above ground says, as uncertain as the vehicle's height."""

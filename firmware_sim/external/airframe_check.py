@@ -141,7 +141,7 @@ def ardupilot_airframe(vehicle: VehicleProfile) -> Airframe:
 
 def refuse_untold(vehicle: VehicleProfile, firmware: str) -> None:
     """Raise FirmwareMissingError for a vehicle with sensors that no such firmware is told of."""
-    for name in ("vision", "rangefinder"):
+    for name in ("vision", "rangefinder", "optical_flow"):
         if getattr(vehicle.sensors, name) is not None:
             raise FirmwareMissingError(
                 f"--firmware {firmware}: the vehicle has sensors.{name}, which only builtin and px4"

@@ -17,7 +17,13 @@ from airl_mav.core.constants import TICK_S, US_PER_S
 from airl_mav.core.frames import Vector, local_to_geodetic
 from airl_mav.profiles.sensors import Sensors
 from firmware_sim.faults.timeline import Acting
-from firmware_sim.interfaces import DistanceReading, GpsFix, Odometry, SensorSample
+from firmware_sim.interfaces import (
+    DistanceReading,
+    FlowReading,
+    GpsFix,
+    Odometry,
+    SensorSample,
+)
 from firmware_sim.plant.sensors import PA_PER_HPA
 
 FIELDS = {
@@ -28,6 +34,7 @@ FIELDS = {
     "gps": "gps",
     "vision": "odometry",
     "rangefinder": "distance",
+    "flow": "flow",
 }
 """Field of a sample, by the sensor's name."""
 
@@ -135,6 +142,9 @@ def shifted(value: Any, offset: Vector) -> Any:
         return value if value.position is None else value._replace(position=value.position + offset)
     if isinstance(value, DistanceReading):
         return farther(value, offset.item(0))
+    if isinstance(value, FlowReading):
+        error = offset * value.interval_s if value.quality > 0 else 0.0
+        return value._replace(flow=value.flow + error)
     if isinstance(value, float):
         return value + offset.item(0)
     return value + offset
@@ -156,7 +166,7 @@ def noise_sd(part: str, profile: Sensors, tick_s: float) -> Vector:
     horizontal, speed = gps.horizontal_noise_m, gps.velocity_noise_m_s
     vision = profile.vision
     seen = (0.0, 0.0) if vision is None else (vision.position_noise_m, vision.velocity_noise_m_s)
-    ranges = profile.rangefinder
+    ranges, flow = profile.rangefinder, profile.optical_flow
     known: dict[str, list[float]] = {
         "accel": [profile.imu.accel_noise_m_s2 * white] * 3,
         "gyro": [profile.imu.gyro_noise_rad_s * white] * 3,
@@ -165,6 +175,7 @@ def noise_sd(part: str, profile: Sensors, tick_s: float) -> Vector:
         "gps": [horizontal, horizontal, gps.vertical_noise_m, speed, speed, speed],
         "vision": [seen[0]] * 3 + [seen[1]] * 3,
         "rangefinder": [0.0 if ranges is None else ranges.noise_m],
+        "flow": [0.0 if flow is None else flow.noise_rad_s] * 2,
     }
     return np.array(known[part])
 

@@ -168,6 +168,19 @@ TOPICS: tuple[Logged, ...] = (
     ),
     Logged(
         Topic(
+            "vehicle_optical_flow",
+            (
+                *("uint64_t timestamp_sample", "uint32_t device_id", "float[2] pixel_flow"),
+                *("float[3] delta_angle", "float distance_m", "uint32_t integration_timespan_us"),
+                *("uint8_t quality", "float max_flow_rate"),
+                *("float min_ground_distance", "float max_ground_distance"),
+            ),
+        ),
+        500 * _EVERY_MS,
+        values.optical_flow,
+    ),
+    Logged(
+        Topic(
             "vehicle_global_position",
             (
                 *("uint64_t timestamp_sample", "double lat", "double lon"),

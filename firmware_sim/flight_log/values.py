@@ -5,10 +5,15 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from airl_mav.core.constants import TICK_US
+from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.frames import Vector, local_to_geodetic, quat_yaw
 from airl_mav.vehicle import atmosphere
 from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Landed, Mode
+from firmware_sim.autopilot.optical_flow import (
+    GREATEST_HEIGHT_M,
+    GREATEST_RAD_S,
+    LEAST_HEIGHT_M,
+)
 from firmware_sim.flight_log.ulog import Values
 from firmware_sim.interfaces import PoseFrame, SensorSample, Truth, VelocityFrame
 
@@ -242,6 +247,26 @@ def distance_sensor(moment: Moment) -> Values | None:
         *(0.0, 0.0, 0.0, 0.0),
         told.orientation,
         enabled,
+    )
+
+
+def optical_flow(moment: Moment) -> Values | None:
+    """Return the newest optical flow and turn [rad], of the first sensor, and its limits."""
+    told, time_us = moment.state.flow, moment.state.flow_us
+    if told is None:
+        return None
+    number = 0
+    return (
+        time_us,
+        number,
+        *told.flow.tolist(),
+        *told.turned.tolist(),
+        _UNKNOWN,
+        round(told.interval_s * US_PER_S),
+        told.quality,
+        GREATEST_RAD_S,
+        LEAST_HEIGHT_M,
+        GREATEST_HEIGHT_M,
     )
 
 

@@ -47,6 +47,7 @@ ONBOARD_HZ: Mapping[str, float] = MappingProxyType(
         "ESC_STATUS": 10.0,
         "RC_CHANNELS": 20.0,
         "DISTANCE_SENSOR": 10.0,
+        "OPTICAL_FLOW_RAD": 10.0,
     }
 )
 """Onboard (API) link, 14580 -> 14540 [Hz]."""
@@ -81,6 +82,7 @@ GCS_HZ: Mapping[str, float] = MappingProxyType(
         "ESC_STATUS": 1.0,
         "RC_CHANNELS": 5.0,
         "DISTANCE_SENSOR": 0.5,
+        "OPTICAL_FLOW_RAD": 1.0,
     }
 )
 """Ground station link, 18570 -> 14550 [Hz]."""

@@ -40,7 +40,7 @@ assert not new, new
 """
 
 
-@pytest.mark.parametrize("vehicle", ["quad", "quad-rgb", "quad-vio", "quad-indoor"])
+@pytest.mark.parametrize("vehicle", ["quad", "quad-rgb", "quad-vio", "quad-indoor", "quad-flow"])
 def test_a_flight_asks_for_no_kernel_that_was_not_there_before(
     vehicle: str, tmp_path: Path
 ) -> None:

@@ -39,7 +39,14 @@ from firmware_sim.autopilot.navigation.plan import Plans
 from firmware_sim.autopilot.navigation.progress import progress
 from firmware_sim.autopilot.port import Failures, LogStore, NoLogs, ParameterValue
 from firmware_sim.autopilot.requests import FollowedTarget, LandingTarget, Obstacles, Request
-from firmware_sim.interfaces import BatterySample, DistanceReading, GpsFix, Odometry, SensorSample
+from firmware_sim.interfaces import (
+    BatterySample,
+    DistanceReading,
+    FlowReading,
+    GpsFix,
+    Odometry,
+    SensorSample,
+)
 
 ORIGIN = Geodetic(47.397743, 8.545594, 489.4)
 READY_US = 100_000
@@ -96,6 +103,8 @@ class KnownState(NamedTuple):
     odometry_us: int = 0
     distance: DistanceReading | None = None
     distance_us: int = 0
+    flow: FlowReading | None = None
+    flow_us: int = 0
     clearance: Clearance | None = None
 
 
@@ -176,6 +185,7 @@ class KinematicAutopilot:
         self.setpoints: list[tuple[Setpoint, int]] = []
         self.odometry: list[Odometry] = []
         self.distances: list[DistanceReading] = []
+        self.flows: list[FlowReading] = []
         self.obstacles: list[Obstacles] = []
         self.gcs_heartbeats: list[int] = []
         self.takeoffs: list[float | None] = []
@@ -300,6 +310,9 @@ class KinematicAutopilot:
 
     def measure_distance(self, reading: DistanceReading) -> None:
         self.distances.append(reading)
+
+    def look_down(self, reading: FlowReading) -> None:
+        self.flows.append(reading)
 
     def landing_target(self, target: LandingTarget) -> None:
         self.landing_targets.append(target)

@@ -10,12 +10,13 @@ from __future__ import annotations
 import math
 from typing import NamedTuple, TypeAlias
 
-from airl_mav.core.constants import DEG, GRAVITY_M_S2
+from airl_mav.core.constants import DEG, GRAVITY_M_S2, US_PER_S
 from airl_mav.core.frames import Geodetic, Vector
 from airl_mav.vehicle.atmosphere import altitude_m
 from firmware_sim.interfaces import (
     ActuatorControls,
     DistanceReading,
+    FlowReading,
     GpsFix,
     Odometry,
     SensorSample,
@@ -28,6 +29,7 @@ GPS = layout("HIL_GPS")
 STATE = layout("HIL_STATE_QUATERNION")
 ODOMETRY = layout("ODOMETRY")
 DISTANCE = layout("DISTANCE_SENSOR")
+FLOW = layout("HIL_OPTICAL_FLOW")
 
 
 class Answer(NamedTuple):
@@ -170,6 +172,22 @@ def distance(told: DistanceReading, time_us: int) -> Values:
         *(0.0, 0.0),
         *(0.0, 0.0, 0.0, 0.0),
         quality,
+    )
+
+
+def flow(told: FlowReading, time_us: int) -> Values:
+    """Return HIL_OPTICAL_FLOW at the firmware's time [µs]; it tells no distance."""
+    temperature, since_us, distance_m = 0, 0, -1.0
+    return (
+        time_us,
+        _ID,
+        _fit(told.interval_s * US_PER_S, (0, 2**32 - 1)),
+        *told.flow.tolist(),
+        *told.turned.tolist(),
+        temperature,
+        told.quality,
+        since_us,
+        distance_m,
     )
 
 

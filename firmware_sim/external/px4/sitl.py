@@ -213,6 +213,9 @@ class Px4Bridge:
         if sample.distance is not None:
             told = hil.distance(sample.distance, now_us)
             data += encoder.frame(hil.DISTANCE, hil.DISTANCE.payload(told))
+        if sample.flow is not None:
+            seen_below = hil.flow(sample.flow, now_us)
+            data += encoder.frame(hil.FLOW, hil.FLOW.payload(seen_below))
         if now_us >= self._state_due_us and self._truth is not None:
             # Keeps its phase, skips what it missed.
             late_us = now_us - self._state_due_us

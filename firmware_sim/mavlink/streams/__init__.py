@@ -18,6 +18,7 @@ from firmware_sim.mavlink.streams import (
     gimbal,
     high_latency,
     information,
+    optical_flow,
     pose,
     sensors,
     status,
@@ -69,6 +70,7 @@ BUILDERS: Mapping[str, Builder] = MappingProxyType(
         "HIGH_LATENCY2": high_latency.high_latency2,
         # Last, as it came last: where streams begin depends on their order.
         "DISTANCE_SENSOR": distance.distance_sensor,
+        "OPTICAL_FLOW_RAD": optical_flow.optical_flow_rad,
     }
 )
 """Streams that need the snapshot only; the server adds those that need more."""

@@ -13,7 +13,7 @@ from firmware_sim.autopilot.autopilot_state import AutopilotState
 
 _NAMES = (
     *("GPS_STATUS", "NAV_CONTROLLER_OUTPUT", "COMMAND_LONG"),
-    *("OPTICAL_FLOW_RAD", "CAMERA_TRIGGER"),
+    "CAMERA_TRIGGER",
     *("SCALED_IMU2", "SCALED_IMU3", "GPS2_RAW"),
     *("SCALED_PRESSURE3", "LANDING_TARGET", "EFI_STATUS", "WIND_COV"),
     *("GPS_RTCM_DATA", "ADSB_VEHICLE", "DEBUG_VECT", "NAMED_VALUE_FLOAT"),
