@@ -23,10 +23,6 @@ from firmware_sim.autopilot.range_finder import RangeFinder
 from firmware_sim.autopilot.terrain_filter import GROUND
 from firmware_sim.interfaces import FlowReading
 
-SIMULATED_MS = 20.0
-"""EKF2_OF_DELAY by default. Here a measurement takes nothing on its way, so that only what is
-assumed beyond it counts, and the half of the time that it took [ms]."""
-
 LEAST_HEIGHT_M, GREATEST_HEIGHT_M, GREATEST_RAD_S = 0.08, 100.0, 8.0
 """SENS_FLOW_MINHGT, SENS_FLOW_MAXHGT, SENS_FLOW_MAXR by default: within them flow is believed."""
 
@@ -83,8 +79,9 @@ class OpticalFlow:
         self._value, self._state = value, state
         self._ground, self._terrain = ground, ground.terrain
         self._fuse_standing = fuse
-        self.horizon = FusionHorizon(SIMULATED_MS)
-        """Where the vehicle was when a measurement that comes now was made (EKF2_OF_DELAY)."""
+        self.horizon = FusionHorizon(0.0)
+        """Where the vehicle was in the middle of the time that a measurement that comes now took:
+        half of that ago, and EKF2_OF_DELAY."""
         self.fused = False
         """Whether it is being fused."""
         self.fused_us: int | None = None
