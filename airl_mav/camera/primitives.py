@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Shape
 from airl_mav.camera.projection import Bent, Image, Pose, Rectangle, View, dot, ray_of
-from airl_mav.core.kernels import kernel
+from airl_mav.core.kernels import borrowing_kernel, kernel
 from airl_mav.vehicle.rotation import Vec
 
 BOX: Final = int(Shape.BOX)
@@ -75,7 +75,7 @@ def _line_start(pose: Pose, ahead: float, y: float) -> Vec:
     return (ahead * f[0] + y * d[0], ahead * f[1] + y * d[1], ahead * f[2] + y * d[2])
 
 
-@kernel
+@borrowing_kernel
 def draw_room(
     out: Image,
     ids: Ids | None,
@@ -138,7 +138,7 @@ def draw_room(
                 marks[u] = found if s > 0.0 else SKY
 
 
-@kernel
+@borrowing_kernel
 def draw_box(
     out: Image,
     ids: Ids | None,
@@ -182,7 +182,7 @@ def draw_box(
     return False
 
 
-@kernel
+@borrowing_kernel
 def draw_cylinder(
     out: Image,
     ids: Ids | None,
@@ -229,7 +229,7 @@ def draw_cylinder(
     return False
 
 
-@kernel
+@borrowing_kernel
 def draw_sphere(
     out: Image,
     ids: Ids | None,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.appearance import TEXTURES
 from airl_mav.camera.textures import LEVELS, STRIDE
-from airl_mav.core.kernels import kernel
+from airl_mav.core.kernels import borrowing_kernel, kernel
 
 F32 = np.float32
 I32 = np.int32
@@ -88,7 +88,7 @@ class Lit(NamedTuple):
     extinction: np.float32
 
 
-@kernel
+@borrowing_kernel
 def surface_of(
     texture: NDArray[np.int8],
     per_m: NDArray[np.float32],
@@ -134,7 +134,7 @@ def texel_at(u: np.float32, v: np.float32, texels2: np.float32) -> np.int32:
     return I32(side * (side + row) + column)
 
 
-@kernel
+@borrowing_kernel
 def paint(
     out: Packed,
     seen: Packed,
