@@ -137,6 +137,11 @@ def borrowing_kernel(function: F) -> F:
     return _compiled(function, forceinline=True, counts=False)
 
 
+def large_borrowing_kernel(function: F) -> F:
+    """Compile a function as `borrowing_kernel`, called and not inlined, as `large_kernel`."""
+    return _compiled(function, forceinline=False, counts=False)
+
+
 def _compiled(function: F, *, forceinline: bool, counts: bool = True) -> F:
     options = {"nogil": True, "error_model": "numpy", "forceinline": forceinline, "_nrt": counts}
     with _caching_in(cache_folder(function.__code__.co_filename)):
