@@ -23,7 +23,7 @@ from airl_mav.arena.relief import plane_at
 from airl_mav.arena.triangles import KEPT, Triangles, triangles_of
 from airl_mav.camera.primitives import GROUND, OBSTACLE
 from airl_mav.camera.projection import MIN_DEPTH_M
-from airl_mav.core.kernels import kernel, large_kernel
+from airl_mav.core.kernels import borrowing_kernel, large_kernel
 from airl_mav.profiles.mesh_file import MeshFile
 from airl_mav.vehicle.rotation import Vec
 
@@ -293,20 +293,20 @@ class Meshes(NamedTuple):
     """What is ground of them."""
 
 
-@kernel
+@borrowing_kernel
 def count_of(meshes: Meshes | None) -> int:
     """Return how many meshes there are."""
     return 0 if meshes is None else len(meshes.first)
 
 
-@kernel
+@borrowing_kernel
 def material_row(meshes: Meshes, k: int) -> int:
     """Return the row of mesh k's material in `Finish`."""
     first = meshes.first[k]
     return FLOOR_ROW if first == GROUND_FIRST else OBSTACLE_ROW + first
 
 
-@kernel
+@borrowing_kernel
 def raised(meshes: Meshes | None, position: Vec | NDArray[np.float64]) -> Vec:
     """Return a camera's place NED [m], raised to `MIN_DEPTH_M` above the ground below it."""
     lowest = -MIN_DEPTH_M
@@ -315,7 +315,7 @@ def raised(meshes: Meshes | None, position: Vec | NDArray[np.float64]) -> Vec:
     return (position[0], position[1], min(position[2], lowest))
 
 
-@kernel
+@borrowing_kernel
 def is_owned(meshes: Meshes | None, i: int) -> bool:
     """Return whether cameras see a mesh in place of obstacle i."""
     return False if meshes is None else meshes.owner[i] >= 0

@@ -18,8 +18,9 @@ from airl_mav.arena.appearance import WALLS as WALLS_ROW
 from airl_mav.camera.bvh import Meshes, count_of, is_owned, raised
 from airl_mav.camera.mesh_shadows import shade_by_meshes
 from airl_mav.camera.mesh_surfaces import shade_meshes
-from airl_mav.camera.primitives import FLOOR, GROUND, OBSTACLE, SKY, Ids
-from airl_mav.camera.projection import MIN_DEPTH_M, Bent, Pose
+from airl_mav.camera.mesh_triangles import Faces
+from airl_mav.camera.primitives import FLOOR, GROUND, OBSTACLE, SKY, Ids, Rectangles
+from airl_mav.camera.projection import MIN_DEPTH_M, Bent, Pose, View
 from airl_mav.camera.raycast import aim, blank, draw_bodies, invert
 from airl_mav.camera.shading import F32, ZERO, Lit, Packed, Plane, Points, Rays, surface_of
 from airl_mav.camera.shadows import CORNERS, shade_by_obstacle, shade_by_walls
@@ -31,7 +32,7 @@ from airl_mav.camera.surfaces import (
     shade_walls,
     write_rays,
 )
-from airl_mav.core.kernels import kernel
+from airl_mav.core.kernels import borrowing_kernel, kernel
 from airl_mav.vehicle.rotation import Quat, Vec
 
 U32 = np.uint32
@@ -145,21 +146,92 @@ def render_colour(
         yaw, meshes, faces,
     )  # fmt: skip
     if inside >= 0:
-        rgb[:, :, :] = 0
-        depth[:, :] = MIN_DEPTH_M
-        seen[:, :] = OBSTACLE + inside
-        if bent is not None:
-            blank(depth, bent)
-            for v in range(depth.shape[0]):
-                for u in range(depth.shape[1]):
-                    seen[v, u] = seen[v, u] if depth[v, u] > ZERO else SKY
+        _show_inside(rgb, depth, seen, inside, bent)
         return
     invert(far)
+    _show(
+        rgb, far, ids, rectangles, faces, work, bent, view, axes, camera, bounds, shape, center,
+        half_size, yaw, meshes, texture, per_m, offset, albedo, lights, atlas,
+    )  # fmt: skip
+    if cylindrical:
+        depth[:, :] = far.T
+        seen[:, :] = ids.T
+
+
+@borrowing_kernel
+def _show_inside(
+    rgb: NDArray[np.uint8], depth: Plane, seen: Ids, inside: int, bent: Bent | None
+) -> None:
+    """Write what is seen from inside an obstacle."""
+    rgb[:, :, :] = 0
+    depth[:, :] = MIN_DEPTH_M
+    seen[:, :] = OBSTACLE + inside
+    if bent is not None:
+        blank(depth, bent)
+        for v in range(depth.shape[0]):
+            for u in range(depth.shape[1]):
+                seen[v, u] = seen[v, u] if depth[v, u] > ZERO else SKY
+
+
+@borrowing_kernel
+def _show(
+    rgb: NDArray[np.uint8],
+    far: Plane,
+    ids: Ids,
+    rectangles: Rectangles,
+    faces: Faces | None,
+    work: Work,
+    bent: Bent | None,
+    view: View,
+    axes: Pose,
+    camera: Vec,
+    bounds: NDArray[np.float64],
+    shape: NDArray[np.int8],
+    center: NDArray[np.float64],
+    half_size: NDArray[np.float64],
+    yaw: NDArray[np.float64],
+    meshes: Meshes | None,
+    texture: NDArray[np.int8],
+    per_m: NDArray[np.float32],
+    offset: NDArray[np.float32],
+    albedo: NDArray[np.float32],
+    lights: NDArray[np.float32],
+    atlas: Plane,
+) -> None:
+    """Write the colours of what `draw_bodies` has drawn.
+
+    Args:
+        rgb: As of `render_colour`.
+        far: (n, m) depth [m]; 0: no surface.
+        ids: (n, m) what each pixel sees; hills become the floor here.
+        rectangles: (obstacles + meshes, 3, 4) that each body was drawn in.
+        faces: (n, m) where a mesh is seen, which of its triangles; None: there are no meshes.
+        work: Its lines and their rays as `aim` wrote them.
+        bent: As of `render_colour`.
+        view: How the image sees.
+        axes: The camera's axes.
+        camera: (3,) NED [m], above the ground.
+        bounds: As of `render_colour`, with the rest.
+        shape: (n,).
+        center: (n, 3).
+        half_size: (n, 3).
+        yaw: (n,).
+        meshes: Those that are seen.
+        texture: (2 + n,).
+        per_m: (2 + n,).
+        offset: (2 + n, 2).
+        albedo: (2 + n, 2, 3).
+        lights: (7, 3).
+        atlas: Of all textures.
+    """
+    lines, xs = work.lines, work.xs
     light = _lit(lights)
     lit, clear, out, points, rays = work.lit, work.clear, work.out, work.points, work.rays
     write_rays(rays, lines, xs, bent, axes)
     to_sun = (float(lights[0, 0]), float(lights[0, 1]), float(lights[0, 2]))
-    all_ids, all_far, all_lit, all_clear = ids.ravel(), far.ravel(), lit.ravel(), clear.ravel()
+    count = ids.size
+    all_ids, all_far = ids.reshape(count), far.reshape(count)
+    all_lit, all_clear = lit.reshape(count), clear.reshape(count)
     extinction = float(light.extinction)
     shade_by_walls(all_lit, all_clear, all_far, rays, camera, bounds, to_sun, extinction)
     sunny = max(max(light.sun[0], light.sun[1]), light.sun[2]) > ZERO
@@ -177,7 +249,7 @@ def render_colour(
             lit, far, ids, faces, work.corners, lines, xs, bent, view, axes, camera, meshes, to_sun
         )
     draw_sky(out, all_ids, points, rays, camera, light)
-    pixel2 = F32(1.0 / (focal * focal))
+    pixel2 = F32(1.0 / (view.focal * view.focal))
     floor = surface_of(texture, per_m, offset, albedo, FLOOR_ROW)
     walls = surface_of(texture, per_m, offset, albedo, WALLS_ROW)
     shade_floor(
@@ -188,29 +260,27 @@ def render_colour(
     )
     if meshes is not None and faces is not None:
         shade_meshes(
-            out, all_ids, all_far, all_lit, all_clear, points, rectangles, meshes, faces.ravel(),
-            lines, xs, bent, axes, camera, texture, per_m, offset, albedo, light, atlas, pixel2,
+            out, all_ids, all_far, all_lit, all_clear, points, rectangles, meshes,
+            faces.reshape(count), lines, xs, bent, axes, camera, texture, per_m, offset, albedo,
+            light, atlas, pixel2,
         )  # fmt: skip
     for i in range(len(shape)):
         if is_owned(meshes, i):
             continue
         world, half = _placed(axes, camera, center, half_size, i)
         surface = surface_of(texture, per_m, offset, albedo, OBSTACLE_ROW + i)
-        for k in range(3 if cylindrical else 1):
+        for k in range(3 if view.cylindrical else 1):
             shade_obstacle(
                 out, all_ids, all_far, all_lit, all_clear, points, rectangles[i, k], i, lines, xs,
                 bent, world, shape[i], half, yaw[i], surface, light, atlas, pixel2,
             )  # fmt: skip
     if bent is not None:
         _blacken(out, bent)
-    unpack(rgb, out, cylindrical)
+    unpack(rgb, out, view.cylindrical)
     _tell_ground(all_ids, meshes)
-    if cylindrical:
-        depth[:, :] = far.T
-        seen[:, :] = ids.T
 
 
-@kernel
+@borrowing_kernel
 def _tell_ground(ids: Ids, meshes: Meshes | None) -> None:
     """Write the floor's number (n,) where hills are seen."""
     if meshes is None:
@@ -219,7 +289,7 @@ def _tell_ground(ids: Ids, meshes: Meshes | None) -> None:
         ids[at] = FLOOR if ids[at] == GROUND else ids[at]
 
 
-@kernel
+@borrowing_kernel
 def _blacken(out: Packed, bent: Bent) -> None:
     """Write black where a fisheye's pixels see nothing at all."""
     n, m = bent.forward.shape
@@ -230,7 +300,7 @@ def _blacken(out: Packed, bent: Bent) -> None:
                 out[v * m + u] = np.int32(0)
 
 
-@kernel
+@borrowing_kernel
 def _placed(
     axes: Pose, camera: Vec, center: NDArray[np.float64], half_size: NDArray[np.float64], i: int
 ) -> tuple[Pose, Vec]:
@@ -240,7 +310,7 @@ def _placed(
     return Pose(axes.forward, axes.across, axes.along, offset), half
 
 
-@kernel
+@borrowing_kernel
 def _lit(lights: NDArray[np.float32]) -> Lit:
     """Return the light of its array."""
     return Lit(
@@ -254,7 +324,7 @@ def _lit(lights: NDArray[np.float32]) -> Lit:
     )
 
 
-@kernel
+@borrowing_kernel
 def unpack(rgb: NDArray[np.uint8], out: Packed, cylindrical: bool) -> None:
     """Write the image of its packed pixels, line after line."""
     height, width, _ = rgb.shape

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.camera.projection import Image, Pose, Rectangle, Span, View, cut, cylinder_span, dot
-from airl_mav.core.kernels import kernel
+from airl_mav.core.kernels import borrowing_kernel, kernel
 from airl_mav.vehicle.rotation import Vec
 
 _MARGIN_PX: Final = 1e-6
@@ -21,7 +21,7 @@ NEAR: Final = 1e-4
 NOWHERE: Final = (0, 0, 0, 0)
 
 
-@kernel
+@borrowing_kernel
 def part_of(
     out: Image,
     view: View,
@@ -50,7 +50,7 @@ def part_of(
     return near, between(view, near, far, x - wide, x + wide, y - high, y + high, outer)
 
 
-@kernel
+@borrowing_kernel
 def _around(out: Image, view: View, span: Span, outer: Rectangle) -> Rectangle:
     """Return the pixels of a part of a cylinder that lie in a span, after any turn of it."""
     low, high = max(span[2], outer[2]), min(span[3], outer[3])

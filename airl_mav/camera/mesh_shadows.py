@@ -18,7 +18,7 @@ from airl_mav.camera.primitives import OBSTACLE, SKY, Ids, Line, Lines
 from airl_mav.camera.projection import Bent, Pose, View, dot, ray_of
 from airl_mav.camera.shading import F32, ZERO, Plane
 from airl_mav.camera.shadows import along32, ray32, shadow_rectangle, start32, widened
-from airl_mav.core.kernels import kernel, large_kernel
+from airl_mav.core.kernels import borrowing_kernel, large_borrowing_kernel, large_kernel
 from airl_mav.vehicle.rotation import Vec
 
 _ABOVE_M: Final = 5e-4
@@ -61,15 +61,15 @@ def shade_by_meshes(
         meshes: Those of the arena.
         to_sun: (3,) unit vector NED.
     """
-    waiting = np.empty(STACK, np.int32)
+    waiting, maybe = np.empty(STACK, np.int32), np.empty(len(xs), np.bool_)
     for k in range(len(meshes.root)):
         _shade_by_mesh(
             lit, far, ids, faces, corners, lines, xs, bent, view, axes, camera, meshes, k, to_sun,
-            waiting,
+            waiting, maybe,
         )  # fmt: skip
 
 
-@large_kernel
+@large_borrowing_kernel
 def _shade_by_mesh(
     lit: Plane,
     far: Plane,
@@ -86,8 +86,9 @@ def _shade_by_mesh(
     k: int,
     to_sun: Vec,
     waiting: NDArray[np.int32],
+    maybe: NDArray[np.bool_],
 ) -> None:
-    """Put the points that mesh k hides into shadow."""
+    """Put the points that mesh k hides into shadow; `maybe` (m,) is room to work in."""
     bvh, root, scale = meshes.bvh, meshes.root[k], meshes.pose[k, 4]
     cos, sin = meshes.pose[k, 2], meshes.pose[k, 3]
     pose = seen_from(axes, camera, meshes.pose, k)
@@ -122,7 +123,6 @@ def _shade_by_mesh(
         F32((half[1] + wide) * abs(inverse[1])),
         F32((half[2] + wide) * abs(inverse[2])),
     )
-    maybe = np.empty(len(xs), np.bool_)
     for v in range(top, bottom):
         start = start32(pose, lines[v, 0], lines[v, 1])
         far_row, ids_row, lit_row = far[v, left:end], ids[v, left:end], lit[v, left:end]
@@ -158,7 +158,7 @@ def _shade_by_mesh(
                 lit_row[u] = ZERO
 
 
-@kernel
+@borrowing_kernel
 def _hit(
     bvh: Bvh,
     root: int,
@@ -213,7 +213,7 @@ def _hit(
         node = waiting[tops]
 
 
-@kernel
+@borrowing_kernel
 def _stops(corners: NDArray[np.float32], i: int, at: Vec, way: Vec, least: float) -> bool:
     """Return whether a ray hits a triangle, from either side, no nearer than `least`.
 

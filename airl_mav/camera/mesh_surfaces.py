@@ -25,11 +25,11 @@ from airl_mav.camera.shading import (
 )
 from airl_mav.camera.shadows import along32, ray32, start32
 from airl_mav.camera.surfaces import STEEP, span_of, texels2
-from airl_mav.core.kernels import large_kernel
+from airl_mav.core.kernels import large_borrowing_kernel
 from airl_mav.vehicle.rotation import Vec
 
 
-@large_kernel
+@large_borrowing_kernel
 def shade_meshes(
     out: Packed,
     ids: Ids,
@@ -90,7 +90,7 @@ def shade_meshes(
         )  # fmt: skip
 
 
-@large_kernel
+@large_borrowing_kernel
 def _shade_mesh(
     out: Packed,
     ids: Ids,

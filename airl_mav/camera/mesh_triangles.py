@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from airl_mav.camera.mesh_parts import NEAR, between, pixels
 from airl_mav.camera.primitives import Ids, Line, Lines
 from airl_mav.camera.projection import Image, Pose, Rectangle, View, dot
-from airl_mav.core.kernels import kernel
+from airl_mav.core.kernels import borrowing_kernel, kernel
 from airl_mav.vehicle.rotation import Vec
 
 _SPARE: Final = 4e-14
@@ -71,7 +71,7 @@ def _signed(v: Vec, sign: float) -> Vec:
     return (sign * v[0], sign * v[1], sign * v[2])
 
 
-@kernel
+@borrowing_kernel
 def draw_triangle(
     out: Image,
     ids: Ids | None,
@@ -150,7 +150,7 @@ def draw_triangle(
                         faces[v, u] = i
 
 
-@kernel
+@borrowing_kernel
 def met(
     corners: NDArray[np.float32], i: int, view: View, pose: Pose, start: Vec, x: float
 ) -> float:

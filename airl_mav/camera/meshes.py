@@ -31,7 +31,7 @@ from airl_mav.camera.projection import (
     fisheye_rectangle,
     ray_of,
 )
-from airl_mav.core.kernels import kernel, large_kernel
+from airl_mav.core.kernels import borrowing_kernel, kernel, large_borrowing_kernel, large_kernel
 from airl_mav.vehicle.rotation import Vec
 
 _LEAST: Final = 1e-12
@@ -41,7 +41,7 @@ _MOST_LOOKED_AT: Final = 256
 """In more pixels it is not looked whether all see something nearer."""
 
 
-@kernel
+@borrowing_kernel
 def seen_from(axes: Pose, camera: Vec, pose: NDArray[np.float64], k: int) -> Pose:
     """Return the camera's axes along mesh k's, and its origin from the camera, in units of it.
 
@@ -106,7 +106,7 @@ def draw_meshes(
             )  # fmt: skip
 
 
-@large_kernel
+@large_borrowing_kernel
 def _draw_mesh(
     out: Image,
     ids: Ids | None,
@@ -179,7 +179,7 @@ def _draw_mesh(
             tops += 1
 
 
-@large_kernel
+@large_borrowing_kernel
 def _cast_mesh(
     out: Image,
     ids: Ids | None,
@@ -216,7 +216,7 @@ def _cast_mesh(
             _cast(out, ids, faces, number, v, u, ray, 0.0, own, pose, bvh, root, per, waiting, 0)
 
 
-@kernel
+@borrowing_kernel
 def _wait(
     waiting: NDArray[np.int32],
     nearest: NDArray[np.float64],
@@ -232,7 +232,7 @@ def _wait(
     nearest[at] = max(near, 1e-12)
 
 
-@kernel
+@borrowing_kernel
 def _hidden(out: Image, part: Rectangle, greatest: float) -> bool:
     """Return whether all pixels of a small part see something nearer than an inverse depth."""
     if (part[1] - part[0]) * (part[3] - part[2]) > _MOST_LOOKED_AT:
@@ -244,7 +244,7 @@ def _hidden(out: Image, part: Rectangle, greatest: float) -> bool:
     return True
 
 
-@kernel
+@borrowing_kernel
 def _cast(
     out: Image,
     ids: Ids | None,
@@ -322,7 +322,7 @@ def inverse_of(x: float) -> float:
     return 1.0 / (max(x, _LEAST) if x >= 0.0 else min(x, -_LEAST))
 
 
-@kernel
+@borrowing_kernel
 def _through(
     boxes: NDArray[np.float32],
     node: int,

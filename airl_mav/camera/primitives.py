@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Shape
 from airl_mav.camera.projection import Bent, Image, Pose, Rectangle, View, dot, ray_of
-from airl_mav.core.kernels import kernel
+from airl_mav.core.kernels import borrowing_kernel, kernel
 from airl_mav.vehicle.rotation import Vec
 
 BOX: Final = int(Shape.BOX)
@@ -75,7 +75,7 @@ def _line_start(pose: Pose, ahead: float, y: float) -> Vec:
     return (ahead * f[0] + y * d[0], ahead * f[1] + y * d[1], ahead * f[2] + y * d[2])
 
 
-@kernel
+@borrowing_kernel
 def draw_room(
     out: Image,
     ids: Ids | None,
@@ -101,6 +101,9 @@ def draw_room(
     lid = 1.0 / (max(top, TINY) if above else min(top, -TINY))
     enter_gain, enter_base, exit_gain = (lid, 0.0, 0.0) if above else (0.0, _UNLIMITED, lid)
     covered, lid_seen = closed and above, 1.0 if closed else 0.0
+    if north.enter_base > 0.0 and east.enter_base > 0.0 and not above:
+        _draw_room_around(out, ids, lines, xs, bent, view, pose, north, east, floor, lid, lid_seen)
+        return
     for v in range(out.shape[0]):
         start = _line_start(pose, lines[v, 0], lines[v, 1])
         row = out[v]
@@ -138,7 +141,60 @@ def draw_room(
                 marks[u] = found if s > 0.0 else SKY
 
 
-@kernel
+@borrowing_kernel
+def _draw_room_around(
+    out: Image,
+    ids: Ids | None,
+    lines: Lines,
+    xs: Line,
+    bent: Bent | None,
+    view: View,
+    pose: Pose,
+    north: _Slab,
+    east: _Slab,
+    floor: float,
+    lid: float,
+    lid_seen: float,
+) -> None:
+    """Draw the room that the camera is in, as `draw_room`: it is entered nowhere, only left.
+
+    Args:
+        out: As of `draw_room`, with those up to `pose`.
+        ids: What is seen.
+        lines: Of the image.
+        xs: Rays of a line.
+        bent: A fisheye's rays.
+        view: How the image sees.
+        pose: The camera's axes.
+        north: Between two walls.
+        east: Between the others.
+        floor: Inverse of its depth below the camera [1/m].
+        lid: That of the lid; negative, as it is above.
+        lid_seen: 1: it is a ceiling; 0: it is open.
+    """
+    for v in range(out.shape[0]):
+        start = _line_start(pose, lines[v, 0], lines[v, 1])
+        row = out[v]
+        if ids is not None:
+            marks = ids[v]
+        for u in range(len(xs)):
+            n, e, d = ray_of(pose, bent, v, u, start, xs[u])
+            norths = max(north.exit_a * n, north.exit_b * n)
+            easts = max(east.exit_a * e, east.exit_b * e)
+            walls, by_floor, by_lid = max(norths, easts), floor * d, lid * d
+            leave = max(walls, by_floor)
+            by_top = leave < by_lid
+            s = lid_seen * by_lid if by_top else leave
+            s = s if s >= view.s_min else 0.0
+            row[u] = s
+            if ids is not None:
+                wall = WALL_NORTH_SOUTH if norths >= easts else WALL_EAST_WEST
+                found = FLOOR if by_floor >= walls else wall
+                found = CEILING if by_top else found
+                marks[u] = found if s > 0.0 else SKY
+
+
+@borrowing_kernel
 def draw_box(
     out: Image,
     ids: Ids | None,
@@ -182,7 +238,7 @@ def draw_box(
     return False
 
 
-@kernel
+@borrowing_kernel
 def draw_cylinder(
     out: Image,
     ids: Ids | None,
@@ -229,7 +285,7 @@ def draw_cylinder(
     return False
 
 
-@kernel
+@borrowing_kernel
 def draw_sphere(
     out: Image,
     ids: Ids | None,

@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.core.kernels import kernel
+from airl_mav.core.kernels import borrowing_kernel, kernel
 from airl_mav.profiles.distortion import Distortion, distorted
 from airl_mav.vehicle.rotation import Vec
 
@@ -69,7 +69,7 @@ class Bent(NamedTuple):
 _distorted = kernel(distorted)
 
 
-@kernel
+@borrowing_kernel
 def ray_of(pose: Pose, bent: Bent | None, v: int, u: int, start: Vec, x: float) -> Vec:
     """Return the ray of pixel u on line v, whose line starts so and whose place on it is x."""
     r = pose.along
@@ -124,7 +124,7 @@ def _reach(axis: Vec, half: Vec, sphere: bool) -> float:
     return abs(half[0] * axis[0]) + abs(half[1] * axis[1]) + abs(half[2] * axis[2])
 
 
-@kernel
+@borrowing_kernel
 def pinhole_rectangle(out: Image, view: View, pose: Pose, half: Vec, sphere: bool) -> Rectangle:
     """Return the pixels of a pinhole that can see a body; empty when none can.
 
@@ -161,7 +161,7 @@ def pinhole_rectangle(out: Image, view: View, pose: Pose, half: Vec, sphere: boo
     return v0, v1, u0, u1
 
 
-@kernel
+@borrowing_kernel
 def cylinder_span(out: Image, view: View, pose: Pose, half: Vec, sphere: bool) -> Span:
     """Return the pixels of a cylinder that can see a body; no pixels of a line when none can.
 
@@ -195,7 +195,7 @@ def cylinder_span(out: Image, view: View, pose: Pose, half: Vec, sphere: bool) -
     return centre - view.focal * half_angle, centre + view.focal * half_angle, v0, v1
 
 
-@kernel
+@borrowing_kernel
 def cut(out: Image, view: View, span: Span, turns: int) -> Rectangle:
     """Return the part of a span that falls into the image after so many turns of the cylinder."""
     around = turns * 2.0 * math.pi * view.focal
@@ -203,7 +203,7 @@ def cut(out: Image, view: View, span: Span, turns: int) -> Rectangle:
     return first, last, span[2], span[3]
 
 
-@kernel
+@borrowing_kernel
 def fisheye_rectangle(
     out: Image, view: View, bent: Bent, pose: Pose, half: Vec, sphere: bool
 ) -> Rectangle:
@@ -236,7 +236,7 @@ def fisheye_rectangle(
     return v0, v1, u0, u1
 
 
-@kernel
+@borrowing_kernel
 def _way_out(view: View, bent: Bent, angle: float) -> float:
     """Return how far from the middle of a fisheye's image an angle falls [px], within its rim."""
     rim = bent.sees_to

@@ -52,11 +52,11 @@ from airl_mav.camera.projection import (
     fisheye_rectangle,
     pinhole_rectangle,
 )
-from airl_mav.core.kernels import kernel
+from airl_mav.core.kernels import borrowing_kernel, kernel
 from airl_mav.vehicle.rotation import Quat, Vec, rotate
 
 
-@kernel
+@borrowing_kernel
 def _draw_obstacle(
     out: Image,
     ids: Ids | None,
@@ -113,7 +113,7 @@ def _draw_obstacle(
     return False
 
 
-@kernel
+@borrowing_kernel
 def invert(out: Image) -> None:
     """Turn inverse depth into depth [m], in place."""
     zero, one = np.float32(0.0), np.float32(1.0)
@@ -126,7 +126,7 @@ def invert(out: Image) -> None:
             row[u] = t if s > zero else zero
 
 
-@kernel
+@borrowing_kernel
 def blank(out: Image, bent: Bent) -> None:
     """Write 0 where a fisheye's pixels see nothing at all."""
     for v in range(out.shape[0]):
@@ -136,7 +136,7 @@ def blank(out: Image, bent: Bent) -> None:
                 out[v, u] = 0.0
 
 
-@kernel
+@borrowing_kernel
 def aim(
     lines: Lines,
     xs: Line,
@@ -182,7 +182,7 @@ def aim(
     return View(focal, cy, cx, s_min, cylindrical), Pose(forward, down, right, nowhere)
 
 
-@kernel
+@borrowing_kernel
 def draw_bodies(
     out: Image,
     ids: Ids | None,

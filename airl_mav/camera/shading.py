@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.appearance import TEXTURES
 from airl_mav.camera.textures import LEVELS, STRIDE
-from airl_mav.core.kernels import kernel
+from airl_mav.core.kernels import borrowing_kernel, kernel
 
 F32 = np.float32
 I32 = np.int32
@@ -88,7 +88,7 @@ class Lit(NamedTuple):
     extinction: np.float32
 
 
-@kernel
+@borrowing_kernel
 def surface_of(
     texture: NDArray[np.int8],
     per_m: NDArray[np.float32],
@@ -134,7 +134,7 @@ def texel_at(u: np.float32, v: np.float32, texels2: np.float32) -> np.int32:
     return I32(side * (side + row) + column)
 
 
-@kernel
+@borrowing_kernel
 def paint(
     out: Packed,
     seen: Packed,
@@ -172,15 +172,17 @@ def paint(
     place, facing, up, pattern, green_of, blue_of = points
     row, marks = out[left:end], seen[left:end]
     lit_row, clear_row = lit[left:end], clear[left:end]
-    # By itself: a loop that reads from all over the atlas does not vectorise.
+    # By itself: a loop that reads from all over the atlas does not vectorise. Unsigned: of a number
+    # with a sign it would ask each time whether it counts from the end.
     for u in range(end - left):
-        pattern[u] = atlas[surface.base + place[u]]
+        pattern[u] = atlas[np.uint64(surface.base + place[u])]
     if surface.step == 0:
         green_of, blue_of = pattern, pattern
     else:
         green_at, blue_at = surface.base + surface.step, surface.base + 2 * surface.step
         for u in range(end - left):
-            green_of[u], blue_of[u] = atlas[green_at + place[u]], atlas[blue_at + place[u]]
+            green_of[u] = atlas[np.uint64(green_at + place[u])]
+            blue_of[u] = atlas[np.uint64(blue_at + place[u])]
     dark, more, sun, horizon = surface.albedo, surface.more, light.sun, light.horizon
     # Of sky and ground: what an upright plane gets of both, and how much more a level one.
     upright = (

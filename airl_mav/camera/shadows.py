@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from airl_mav.camera.primitives import BOX, CYLINDER, OBSTACLE, Ids, Line, Lines, turned
 from airl_mav.camera.projection import Bent, Pose, Rectangle, View, dot, ray_of
 from airl_mav.camera.shading import F32, ONE, ZERO, Plane, Rays, Vec32
-from airl_mav.core.kernels import kernel
+from airl_mav.core.kernels import borrowing_kernel, kernel
 from airl_mav.vehicle.rotation import Vec
 
 _NEAR_M: Final = 0.01
@@ -52,7 +52,7 @@ def widened(left: int, end: int, low: int, high: int) -> tuple[int, int]:
     return first, min(first + whole, high)
 
 
-@kernel
+@borrowing_kernel
 def shade_by_walls(
     lit: Plane,
     clear: Plane,
@@ -113,7 +113,7 @@ def along32(pose: Pose) -> Vec32:
     return F32(r[0]), F32(r[1]), F32(r[2])
 
 
-@kernel
+@borrowing_kernel
 def ray32(
     pose: Pose, along: Vec32, bent: Bent | None, v: int, u: int, start: Vec32, x: np.float32
 ) -> Vec32:
@@ -124,7 +124,7 @@ def ray32(
     return F32(n), F32(e), F32(d)
 
 
-@kernel
+@borrowing_kernel
 def shade_by_obstacle(
     lit: Plane,
     far: Plane,
@@ -228,7 +228,7 @@ def shade_by_obstacle(
                 lit_row[u] = ZERO if hidden else lit_row[u]
 
 
-@kernel
+@borrowing_kernel
 def shadow_rectangle(
     corners: NDArray[np.float64],
     n_lines: int,

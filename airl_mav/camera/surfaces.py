@@ -46,7 +46,7 @@ from airl_mav.camera.shading import (
 )
 from airl_mav.camera.shadows import along32, ray32, start32, widened
 from airl_mav.camera.textures import SIDE
-from airl_mav.core.kernels import kernel
+from airl_mav.core.kernels import borrowing_kernel, kernel
 from airl_mav.vehicle.rotation import Vec
 
 BLOCK: Final = 512
@@ -61,7 +61,7 @@ STEEP: Final = F32(0.02)
 """Least cosine between ray and normal for the size of a pixel."""
 
 
-@kernel
+@borrowing_kernel
 def span_of(
     ids: Ids, low: int, high: int, left: int, end: int, first: np.int32, last: np.int32
 ) -> tuple[int, int]:
@@ -81,7 +81,7 @@ def span_of(
     return widened(left + int(begin), left + int(stop), low, high)
 
 
-@kernel
+@borrowing_kernel
 def write_rays(rays: Rays, lines: Lines, xs: Line, bent: Bent | None, axes: Pose) -> None:
     """Write the ray of every pixel of an image's lines."""
     r = along32(axes)
@@ -97,7 +97,7 @@ def write_rays(rays: Rays, lines: Lines, xs: Line, bent: Bent | None, axes: Pose
             north[u], east[u], down[u] = ray32(axes, r, bent, v, u, start, F32(xs[u]))
 
 
-@kernel
+@borrowing_kernel
 def draw_sky(out: Packed, ids: Ids, points: Points, rays: Rays, camera: Vec, light: Lit) -> None:
     """Write what is seen where there is no surface: sky, and below the horizon level ground.
 
@@ -143,7 +143,7 @@ def texels2(surface: Surface, pixel2: np.float32) -> np.float32:
     return texels * texels * pixel2
 
 
-@kernel
+@borrowing_kernel
 def shade_floor(
     out: Packed,
     ids: Ids,
@@ -178,7 +178,7 @@ def shade_floor(
         paint(out, ids, lit, clear, left, end, own, own, points, floor, light, atlas)
 
 
-@kernel
+@borrowing_kernel
 def shade_walls(
     out: Packed,
     ids: Ids,
@@ -217,7 +217,7 @@ def shade_walls(
         paint(out, ids, lit, clear, left, end, first, last, points, walls, light, atlas)
 
 
-@kernel
+@borrowing_kernel
 def shade_obstacle(
     out: Packed,
     ids: Ids,

@@ -125,11 +125,27 @@ def large_kernel(function: F) -> F:
     return _compiled(function, forceinline=False)
 
 
-def _compiled(function: F, *, forceinline: bool) -> F:
+def borrowing_kernel(function: F) -> F:
+    """Compile a function as `kernel` does, without counting who holds its arrays.
+
+    numba counts the holders of every array: one more for each view, `row[left:end]`, one less when
+    it is done with, both atomically. Where an image is drawn in short rows, that is half the time.
+
+    For what only borrows arrays: all are the caller's, who holds them until it returns. It can make
+    none (numba refuses to compile it), and must return none, not even within a tuple.
+    """
+    return _compiled(function, forceinline=True, counts=False)
+
+
+def large_borrowing_kernel(function: F) -> F:
+    """Compile a function as `borrowing_kernel`, called and not inlined, as `large_kernel`."""
+    return _compiled(function, forceinline=False, counts=False)
+
+
+def _compiled(function: F, *, forceinline: bool, counts: bool = True) -> F:
+    options = {"nogil": True, "error_model": "numpy", "forceinline": forceinline, "_nrt": counts}
     with _caching_in(cache_folder(function.__code__.co_filename)):
-        return cast(
-            F, njit(cache=True, nogil=True, error_model="numpy", forceinline=forceinline)(function)
-        )
+        return cast(F, njit(cache=True, **options)(function))
 
 
 class _Compiler(event.Listener):  # type: ignore[misc]

@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+import importlib
 import os
+import pkgutil
 import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any, get_args, get_type_hints
 
+import numpy as np
+import pytest
+from numba import TypingError
+from numpy.typing import NDArray
+
+from airl_mav import camera
+from airl_mav.camera.colour import Work
 from airl_mav.core import cache, compiling, kernels
 from tests.support.processes import run_alone
 
@@ -101,3 +111,40 @@ def test_who_waits_is_told_of_compiling_and_of_none_from_the_cache(tmp_path: Pat
         told.append(ran.stdout.split())
     # The inner one is part of the outer one's compiling.
     assert told == [["True", "False", "done"], ["done"]]
+
+
+def parts_of(hint: Any) -> set[Any]:
+    """Return all types that a value of a type is made of."""
+    inner = (*get_args(hint), *get_type_hints(hint if isinstance(hint, type) else object).values())
+    return {hint, getattr(hint, "__origin__", hint)}.union(*map(parts_of, inner))
+
+
+def test_no_kernel_that_borrows_arrays_returns_one() -> None:
+    """Its caller would let go of an array that nobody has counted it as a holder of."""
+    assert np.ndarray in parts_of(tuple[int, Work])
+    borrowing = {
+        each
+        for found in pkgutil.iter_modules(camera.__path__, f"{camera.__name__}.")
+        for each in vars(importlib.import_module(found.name)).values()
+        if getattr(each, "targetoptions", {}).get("_nrt") is False
+    }
+    assert len(borrowing) > 20
+    for each in borrowing:
+        returned = get_type_hints(each.py_func)["return"]
+        assert np.ndarray not in parts_of(returned), each.__name__
+
+
+def test_numba_refuses_a_borrowing_kernel_an_array_of_its_own() -> None:
+    @kernels.borrowing_kernel
+    def makes(n: int) -> float:
+        return float(np.ones(n).sum())
+
+    @kernels.borrowing_kernel
+    def returns(row: NDArray[np.float64]) -> NDArray[np.float64]:
+        return row[1:]
+
+    message = "Only accept returning of array passed"
+    with pytest.raises(TypingError, match=message):
+        makes(3)
+    with pytest.raises(TypingError, match=message):
+        returns(np.ones(3))
