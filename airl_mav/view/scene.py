@@ -115,6 +115,10 @@ class FlightScene:
         self._picture: Any = None
 
     def _add(self, kind: str, name: str, *args: Any, **properties: Any) -> Any:
+        if kind == "box":
+            # Its corners have a normal for each side: it looks the same, and a page without a GPU
+            # has one shader fewer to compile before it shows anything.
+            properties["flat_shading"] = False
         return getattr(self._scene, f"add_{kind}")(f"{self._root}{name}", *args, **properties)
 
     def draw(self, shown: Shown, *, picture: bool) -> None:
