@@ -9,7 +9,7 @@ import viser
 from airl_mav.core.clock import Clock, WallClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.flight.record import EpisodeRecord
-from airl_mav.report.replay.flight import ReplayedFlight, parting_s
+from airl_mav.report.replay.flight import ReplayedFlight, name_of, parting_s
 from airl_mav.report.replay.runs import ReplayedRun
 from airl_mav.view.look import OTHER
 from airl_mav.view.panel import Panel
@@ -49,7 +49,7 @@ class ReplayPage:
         beside: ReplayedRun | None = None,
         first: EpisodeRecord | None = None,
     ) -> None:
-        """Build the page.
+        """Build the page, as it is at the beginning of the first flight.
 
         Args:
             server: Whose.
@@ -79,7 +79,13 @@ class ReplayPage:
         self._glides_s = 0.0
         """In how much time the scene is there [wall s]; 0: it does not follow it."""
         self._drawn = 0
-        self._choose(first or run.records[0])
+        first = first or run.records[0]
+        # A page that is open already builds its panel while the arena is made.
+        self._shown.flight = name_of(first)
+        self._panel.draw(self._shown)
+        self._choose(first)
+        # Whoever comes finds the flight there, instead of asking for it.
+        self.draw()
 
     def _add_head(self) -> None:
         gui = self._gui
@@ -119,7 +125,9 @@ class ReplayPage:
     def _choose(self, record: EpisodeRecord) -> None:
         """Show another flight, from its beginning."""
         self._flight: ReplayedFlight = self._run.flight(record)
-        self._other = None if self._beside is None else self._beside.same(record)
+        self._other = None
+        if self._beside is not None and (same := self._beside.same(record)) is not None:
+            self._other = self._beside.flight(same)
         self._flight.begin(self._shown)
         self._others = Shown()
         if self._other is not None:

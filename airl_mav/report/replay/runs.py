@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from airl_mav.core.errors import FieldError, UsageError
-from airl_mav.flight.record import EpisodeRecord
+from airl_mav.flight.record import NO_ARENA, EpisodeRecord
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import LoadedRun, load
-from airl_mav.report.arenas import arenas_of, vehicle_of
-from airl_mav.report.forensics.worst import ranked
-from airl_mav.report.replay.flight import ReplayedFlight
+from airl_mav.report.arenas import arenas_of, spec_of, vehicle_of
+from airl_mav.report.forensics.ranking import ranked
+
+if TYPE_CHECKING:
+    from airl_mav.report.replay.flight import ReplayedFlight
 
 
 class ReplayedRun:
@@ -44,8 +47,16 @@ class ReplayedRun:
             raise FieldError("flight", index, f"{numbers[0]} to {numbers[-1]}, as far as recorded")
         return found
 
+    def check(self, record: EpisodeRecord) -> None:
+        """Raise UsageError unless the arena of a flight can be made."""
+        if record.arena != NO_ARENA:
+            spec_of(record.arena)
+
     def flight(self, record: EpisodeRecord) -> ReplayedFlight:
         """Return a flight. Raises UsageError where its arena cannot be made any more."""
+        # Imported here: what draws images takes longer to import than a run to read.
+        from airl_mav.report.replay.flight import ReplayedFlight
+
         index = record.index
         if index not in self._made:
             run = self._run
@@ -59,10 +70,10 @@ class ReplayedRun:
             )
         return self._made[index]
 
-    def same(self, record: EpisodeRecord) -> ReplayedFlight | None:
+    def same(self, record: EpisodeRecord) -> EpisodeRecord | None:
         """Return the flight of the same seed and arena as another run's; None: there is none."""
         key = (record.seed, record.arena, record.arena_seed, record.zone)
         for each in self.records:
             if (each.seed, each.arena, each.arena_seed, each.zone) == key:
-                return self.flight(each)
+                return each
         return None
