@@ -190,7 +190,7 @@ class ReplayedFlight:
         """Make `shown` this flight's, instead of another's."""
         record = self.record
         shown.take(self.episode, None)
-        shown.flight = name_of(record)
+        shown.flight = Flight.of(record)
         shown.trail = self.trail
         shown.texts.clear()
         for fault in record.faults:
@@ -199,11 +199,6 @@ class ReplayedFlight:
             shown.texts.append(Said(time_us=None, severity=WARNING, text=note))
         how = f"{record.outcome.value}: {record.reason}"
         shown.texts.append(Said(time_us=record.ended_us, severity=INFO, text=how))
-
-
-def name_of(record: EpisodeRecord) -> Flight:
-    """Return what a view calls a flight."""
-    return Flight(index=record.index, seed=record.seed, goal=record.goal)
 
 
 def parting_s(first: ReplayedFlight, other: ReplayedFlight) -> float | None:

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import viser
 
 from airl_mav.core.clock import Clock, WallClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.flight.record import EpisodeRecord
-from airl_mav.report.replay.flight import ReplayedFlight, name_of, parting_s
 from airl_mav.report.replay.runs import ReplayedRun
 from airl_mav.view.look import OTHER
+from airl_mav.view.messages import Flight
 from airl_mav.view.panel import Panel
 from airl_mav.view.scene import FlightScene
 from airl_mav.view.shown import Shown
 from airl_mav.view.watchers import Watchers
+
+if TYPE_CHECKING:
+    # Not before the panel is there: with it comes numba.
+    from airl_mav.report.replay.flight import ReplayedFlight
 
 DRAW_US = 33_000
 """Time between two drawings [wall µs]."""
@@ -81,11 +85,12 @@ class ReplayPage:
         self._drawn = 0
         first = first or run.records[0]
         # A page that is open already builds its panel while the arena is made.
-        self._shown.flight = name_of(first)
-        self._panel.draw(self._shown)
+        self._shown.flight = Flight.of(first)
+        self._panel.draw_title(self._shown)
         self._choose(first)
-        # Whoever comes finds the flight there, instead of asking for it.
+        # Whoever comes finds the flight there and in sight, instead of asking for it.
         self.draw()
+        self._watchers.expect(self._shown)
 
     def _add_head(self) -> None:
         gui = self._gui
@@ -116,6 +121,8 @@ class ReplayPage:
 
         @self._part.on_click
         def _(_event: object) -> None:
+            from airl_mav.report.replay.flight import parting_s
+
             if self._other is not None and (at := parting_s(self._flight, self._other)) is not None:
                 self._playing = False
                 self._go_to(at)
