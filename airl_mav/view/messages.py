@@ -8,7 +8,7 @@ uint16 millimetres of depth, or bytes of colour.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +22,6 @@ from airl_mav.profiles.appearance import DEFAULT, Appearance
 from airl_mav.profiles.mesh_file import MeshFile
 from airl_mav.profiles.projection import Projection
 from airl_mav.profiles.vehicle import Momentum, VehicleProfile
-
-if TYPE_CHECKING:
-    from airl_mav.flight.record import EpisodeRecord
 
 Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
@@ -305,11 +302,6 @@ class Flight(Message):
     index: int
     seed: int
     goal: Goal
-
-    @classmethod
-    def of(cls, record: EpisodeRecord) -> Flight:
-        """Return what is told of a recorded flight."""
-        return cls(index=record.index, seed=record.seed, goal=record.goal)
 
 
 class Phase(Message):

@@ -106,6 +106,7 @@ class FlightScene:
         if self._base is not None:
             self._base.remove()  # and all below it
         self._base = self._scene.add_frame(self._root, show_axes=False)
+        self._is_surrounded = False
         self._movers: list[Any] = []
         self._blades: list[Any] = []
         self._turns = np.zeros(4)
@@ -130,7 +131,10 @@ class FlightScene:
             if shown.episodes != self._drawn:
                 self._drawn = shown.episodes
                 self._reset()
-                self._build(episode, shown.arena)
+                self._build(episode)
+            if shown.is_surrounded and not self._is_surrounded:
+                self._is_surrounded = True
+                self._surround(episode, shown.arena)
             if shown.vehicle is not None:
                 self._move(shown, shown.vehicle, episode)
         if picture:
@@ -144,13 +148,17 @@ class FlightScene:
 
     # --- once an episode
 
-    def _build(self, episode: Episode, arena: Arena | None) -> None:
+    def _surround(self, episode: Episode, arena: Arena | None) -> None:
+        """Build what stands around the flight."""
         if self._look.whole:
             bounds = OPEN if arena is None else arena.bounds
             self._build_floor(bounds)
             self._build_ends(episode, 0.6 * bounds.height, _below(arena, episode.goal))
             if arena is not None:
                 self._build_arena(arena)
+
+    def _build(self, episode: Episode) -> None:
+        """Build what flies."""
         self._build_vehicle(episode.vehicle)
         none = np.zeros((0, 2, 3), np.float32)
         # At the vehicle's place, by a message of the same kind: they move with it, not behind it.

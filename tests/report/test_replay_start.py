@@ -8,10 +8,13 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from airl_mav.cli.main import main
+from airl_mav.flight.record import EpisodeRecord
+from airl_mav.report.replay.flight import ReplayedFlight
 from airl_mav.report.replay.runs import ReplayedRun
 from tests.support.processes import ROOT
 from tests.support.run_demo import write_demo_run
@@ -151,17 +154,32 @@ def refused(
     assert said in err
 
 
-def test_whoever_opens_the_page_finds_the_flight(flown: Path) -> None:
-    """A page need not tell first that it is there."""
+def test_the_flight_is_shown_before_its_arena_and_before_anyone_looks(
+    flown: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from airl_mav.report.replay.page import ReplayPage
     from airl_mav.view.local_server import LocalServer
 
     run = ReplayedRun(flown)
     server = LocalServer(0)
+    make, flying = run.flight, {}
+
+    def node(name: str) -> Any:
+        return server.scene.get_handle_by_name(f"/flight/{name}")
+
+    def flight(record: EpisodeRecord) -> ReplayedFlight:
+        flying.update({name: node(name) for name in ("vehicle", "trail/0")})
+        assert all(flying.values())
+        assert node("arena/walls") is None
+        return make(record)
+
+    monkeypatch.setattr(run, "flight", flight)
     try:
         page = ReplayPage(server, run)
-        for node in ("vehicle", "trail/0", "arena/walls", "arena/obstacle/0"):
-            assert server.scene.get_handle_by_name(f"/flight/{node}") is not None
+        assert {name: node(name) for name in flying} == flying, "they are not built again"
+        assert node("arena/walls") is not None
+        assert node("arena/obstacle/0") is not None
+        assert page._shown.picture is not None
         assert f"seed {run.records[0].seed}" in page._panel._title.content
     finally:
         server.stop()

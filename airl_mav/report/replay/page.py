@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import viser
 
 from airl_mav.core.clock import Clock, WallClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.flight.record import EpisodeRecord
+from airl_mav.report.replay.flight import ReplayedFlight, parting_s
 from airl_mav.report.replay.runs import ReplayedRun
 from airl_mav.view.look import OTHER
-from airl_mav.view.messages import Flight
 from airl_mav.view.panel import Panel
 from airl_mav.view.scene import FlightScene
 from airl_mav.view.shown import Shown
 from airl_mav.view.watchers import Watchers
-
-if TYPE_CHECKING:
-    # Not before the panel is there: with it comes numba.
-    from airl_mav.report.replay.flight import ReplayedFlight
 
 DRAW_US = 33_000
 """Time between two drawings [wall µs]."""
@@ -83,14 +79,7 @@ class ReplayPage:
         self._glides_s = 0.0
         """In how much time the scene is there [wall s]; 0: it does not follow it."""
         self._drawn = 0
-        first = first or run.records[0]
-        # A page that is open already builds its panel while the arena is made.
-        self._shown.flight = Flight.of(first)
-        self._panel.draw_title(self._shown)
-        self._choose(first)
-        # Whoever comes finds the flight there and in sight, instead of asking for it.
-        self.draw()
-        self._watchers.expect(self._shown)
+        self._open(run.way(first or run.records[0]))
 
     def _add_head(self) -> None:
         gui = self._gui
@@ -121,21 +110,43 @@ class ReplayPage:
 
         @self._part.on_click
         def _(_event: object) -> None:
-            from airl_mav.report.replay.flight import parting_s
-
             if self._other is not None and (at := parting_s(self._flight, self._other)) is not None:
                 self._playing = False
                 self._go_to(at)
 
     # --- where it is
 
+    def _open(self, way: ReplayedFlight) -> None:
+        """Show a flight first as it flew, then with its arena, which takes a while to be made.
+
+        Whoever opens the page finds all that there is by then, without asking for it.
+        """
+        self._flight: ReplayedFlight = way
+        way.begin(self._shown)
+        self._shown.is_surrounded = False
+        self._go_to(self._begin_s())
+        way.show(self._shown, self._seconds)
+        self._scene.draw(self._shown, picture=False)
+        self._watchers.expect(self._shown)
+        self._panel.draw_title(self._shown)
+        flight = self._run.flight(way.record)
+        if self._flight is way:  # Nobody has chosen another one meanwhile.
+            self._flight = flight
+            flight.surround(self._shown)
+            self._accompany(way.record)
+            self.draw()
+
     def _choose(self, record: EpisodeRecord) -> None:
         """Show another flight, from its beginning."""
-        self._flight: ReplayedFlight = self._run.flight(record)
+        self._flight = self._run.flight(record)
+        self._flight.begin(self._shown)
+        self._accompany(record)
+
+    def _accompany(self, record: EpisodeRecord) -> None:
+        """Let the other run's flight fly beside, and set the panel to their beginning."""
         self._other = None
         if self._beside is not None and (same := self._beside.same(record)) is not None:
             self._other = self._beside.flight(same)
-        self._flight.begin(self._shown)
         self._others = Shown()
         if self._other is not None:
             self._other.begin(self._others)

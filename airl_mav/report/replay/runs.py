@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.flight.record import NO_ARENA, EpisodeRecord
@@ -11,9 +11,7 @@ from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import LoadedRun, load
 from airl_mav.report.arenas import arenas_of, spec_of, vehicle_of
 from airl_mav.report.forensics.ranking import ranked
-
-if TYPE_CHECKING:
-    from airl_mav.report.replay.flight import ReplayedFlight
+from airl_mav.report.replay.flight import ReplayedFlight
 
 
 class ReplayedRun:
@@ -52,22 +50,24 @@ class ReplayedRun:
         if record.arena != NO_ARENA:
             spec_of(record.arena)
 
+    def way(self, record: EpisodeRecord) -> ReplayedFlight:
+        """Return a flight without its arena, which takes longer to make than all the rest."""
+        index, run = record.index, self._run
+        return ReplayedFlight(
+            record,
+            run.trajectories[index],
+            run.latency.get(index, {}),
+            None,
+            self._vehicle,
+            bool(run.info.config.get("pilot", {}).get("compensate")),
+        )
+
     def flight(self, record: EpisodeRecord) -> ReplayedFlight:
         """Return a flight. Raises UsageError where its arena cannot be made any more."""
-        # Imported here: what draws images takes longer to import than a run to read.
-        from airl_mav.report.replay.flight import ReplayedFlight
-
         index = record.index
         if index not in self._made:
-            run = self._run
-            self._made[index] = ReplayedFlight(
-                record,
-                run.trajectories[index],
-                run.latency.get(index, {}),
-                arenas_of([record], self._vehicle).get(index),
-                self._vehicle,
-                bool(run.info.config.get("pilot", {}).get("compensate")),
-            )
+            arena = arenas_of([record], self._vehicle).get(index)
+            self._made[index] = replace(self.way(record), arena=arena)
         return self._made[index]
 
     def same(self, record: EpisodeRecord) -> EpisodeRecord | None:
