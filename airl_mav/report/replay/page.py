@@ -79,6 +79,8 @@ class ReplayPage:
         self._glides_s = 0.0
         """In how much time the scene is there [wall s]; 0: it does not follow it."""
         self._drawn = 0
+        self._other: ReplayedFlight | None = None
+        """What flies beside."""
         self._open(run.way(first or run.records[0]))
 
     def _add_head(self) -> None:
