@@ -11,9 +11,11 @@ live      A flight of 31 vehicle states and 10 images a second reaches the page 
           again on a page of 64x64 pixels, which leaves out most of what pixels take.
 memory    Half an hour of flights of a minute each, sent thirty times as fast: growth of the view's
           process and of the page's JavaScript heap, after their garbage is collected.
-replay    `airl view` of a run of 100 flights: from the command to the flight on the page, how long
-          a moment takes to be drawn by the server, and updates a second while the slider is
-          dragged.
+replay    `airl view` of a run of 100 flights: from the command to a frame with the flight, and to
+          one with its arena; how long a moment takes to be drawn by the server, and updates a
+          second while the slider is dragged. Where Python keeps no bytecode
+          (PYTHONDONTWRITEBYTECODE), each start compiles all that it imports: the first line says
+          so.
 """
 
 from __future__ import annotations
@@ -68,8 +70,11 @@ RADIUS_M, TURN_RAD_S, ALTITUDE_M = 4.0, 0.4, 2.5
 """Of the circle that is flown around the start."""
 
 COUNTING = """(() => {
-  const told = {pose: 0, image: 0, messages: 0, frames: 0, drawn: false};
+  const told = {pose: 0, image: 0, walls: 0, messages: 0, frames: 0, drawn: false};
   window.told = told;
+  const drawn = {flight: false, arena: false};
+  // A frame puts what has arrived into the scene; the next one draws it.
+  let arrived = {}, there = {};
   const Plain = window.Worker;
   window.Worker = class extends Plain {
     constructor(...words) {
@@ -79,6 +84,7 @@ COUNTING = """(() => {
           told.messages += 1;
           const text = message.type + " " + (message.name ?? message.uuid ?? "");
           if (/^SetPosition.* \\/flight\\/vehicle$/.test(text)) told.pose += 1;
+          if (/\\/flight\\/arena\\/walls$/.test(text)) told.walls += 1;
           if (/\\/flight\\/vehicle\\/camera$/.test(text) && message.type.includes("Update"))
             told.image += 1;
         }
@@ -89,17 +95,28 @@ COUNTING = """(() => {
     const plain = WebGL2RenderingContext.prototype[name];
     WebGL2RenderingContext.prototype[name] = function (...words) {
       told.drawn = true;
+      drawn.flight ||= there.flight;
+      drawn.arena ||= there.arena;
       return plain.apply(this, words);
     };
   }
   const count = () => {
     if (told.drawn) told.frames += 1;
     told.drawn = false;
+    if (!told.arena) {
+      [told.flight, told.arena, there] = [drawn.flight, drawn.arena, arrived];
+      const flight = told.pose > 0 && /seed \\d/.test(document.body?.innerText ?? "");
+      arrived = {flight, arena: flight && told.walls > 0};
+    }
     requestAnimationFrame(count);
   };
   requestAnimationFrame(count);
 })()"""
-"""Counts what the page's worker hands over, and the frames in which anything was drawn."""
+"""Counts what the page's worker hands over, and the frames in which anything was drawn.
+
+`flight` and `arena` are true once a frame is done that was drawn with them there, and with the
+panel that says which flight it is.
+"""
 
 
 def say(*words: object) -> None:
@@ -352,10 +369,12 @@ def measure_replay(folder: Path, flights: int = 100) -> None:
                 url = process.stdout.readline().split()[-1]
                 served = time.monotonic() - began
                 page.open(url)
-                wait_for(lambda: "seed" in page.text() and page.evaluate("window.told?.pose > 0"))
+                wait_for(lambda: page.evaluate("window.told?.flight"))
                 shown = time.monotonic() - began
+                wait_for(lambda: page.evaluate("told.arena"))
+                whole = time.monotonic() - began
                 say(f"replay of {flights} flights, {attempt}: served after {served:.2f} s, shown"
-                    f" after {shown:.2f} s; {load()}")  # fmt: skip
+                    f" after {shown:.2f} s, with arena after {whole:.2f} s; {load()}")  # fmt: skip
                 moves, found = scrub(page)
                 say(
                     f"scrubbing: the page takes {moves:.1f} moves/s; pose {found.pose:.1f}/s"
@@ -445,7 +464,7 @@ def main() -> None:
         with closing(Feed(ViewEnds.model_validate_json(ends))) as feed:
             Circle().fly(feed, float(seconds), float(speed))
         return
-    say(load())
+    say(load() + ("; Python keeps no bytecode" if sys.dont_write_bytecode else ""))
     for name in asked.what or MEASURES:
         say(f"--- {name}")
         with tempfile.TemporaryDirectory() as folder:

@@ -69,8 +69,12 @@ def run(options: ViewOptions, console: Console | None = None) -> int:
     if options.trust:
         for folder in folders:
             trust_arenas(load(folder))
-    replayed, *others = (ReplayedRun(folder) for folder in folders)
-    first = None if options.flight is None else replayed.record(options.flight)
+    runs = [ReplayedRun(folder) for folder in folders]
+    replayed, *others = runs
+    first = replayed.records[0] if options.flight is None else replayed.record(options.flight)
+    for each in runs:
+        if (same := each.same(first)) is not None:
+            each.check(same)
     # Imported here: what draws is an extra.
     from airl_mav.view.local_server import LocalServer
 
@@ -83,7 +87,8 @@ def run(options: ViewOptions, console: Console | None = None) -> int:
             raise FieldError("port", options.port, problem="it is taken; accepted: a free one")
         console.print(f"view  http://{LOOPBACK}:{port}", soft_wrap=True, highlight=False)
         console.file.flush()
-        # A browser loads the page while the flight is prepared.
+        # A browser loads the page while the flight is prepared: what compiles and draws takes
+        # longer to import than all above.
         from airl_mav.report.replay.page import ReplayPage
 
         ReplayPage(server, replayed, others[0] if others else None, first).run()

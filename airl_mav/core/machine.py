@@ -1,7 +1,8 @@
 """What a machine's speed depends on at a moment: governor, frequency, temperature, throttling.
 
 psutil reads what it knows; governor and throttling are read from where Linux and the Raspberry Pi's
-firmware offer them. None stands for what a system does not offer.
+firmware offer them. None stands for what a system does not offer. psutil is imported where it is
+asked: the records of flights need this module, and whoever reads them asks nothing.
 """
 
 from __future__ import annotations
@@ -12,8 +13,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-
-import psutil
 
 NOT_OFFERED = "not offered by this system"
 VCGENCMD_TIMEOUT_S = 5.0
@@ -83,6 +82,8 @@ def machine_state(
         ask_pi: Returns what `vcgencmd get_throttled` says, None where there is no such program;
             None asks it.
     """
+    import psutil
+
     governors = (root / "sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq/scaling_governor")
     cores = _core_frequencies()
     now = [core.current for core in cores]
@@ -100,6 +101,8 @@ def machine_state(
 
 def _core_frequencies() -> Sequence[Any]:
     """Return what psutil says of each core's frequency; empty where it says nothing."""
+    import psutil
+
     return (psutil.cpu_freq(percpu=True) if hasattr(psutil, "cpu_freq") else None) or ()
 
 
@@ -111,6 +114,8 @@ def mean_frequency_mhz() -> float | None:
 
 def temperature_c() -> float | None:
     """Return the hottest sensor of the processor [°C]."""
+    import psutil
+
     if not hasattr(psutil, "sensors_temperatures"):  # Linux and FreeBSD have it.
         return None
     return max(

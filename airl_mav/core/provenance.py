@@ -10,8 +10,6 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-import psutil
-
 from airl_mav import __version__
 from airl_mav.core.clock import utc_now
 
@@ -62,6 +60,9 @@ def provenance(command: str) -> dict[str, Any]:
 
 def describe_machine() -> dict[str, Any]:
     """Return processor, cores, memory, operating system and Python. No names, no addresses."""
+    # Imported here: whoever reads a run does not ask about the machine.
+    import psutil
+
     return {
         "cpu": _cpu_model(),
         "architecture": platform.machine(),

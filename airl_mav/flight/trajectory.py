@@ -91,6 +91,15 @@ class Trajectory:
         return cls(**{field.name: arrays[field.name] for field in fields(cls)})
 
 
+def pose_at(
+    path: Trajectory, time_us: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return position (3,), velocity (3,) and quaternion (4,), the nearest there is to a time."""
+    time = min(max(time_us, int(path.time_us[0])), int(path.time_us[-1]))
+    at = path.between(time, time)
+    return at.position[0], at.velocity[0], at.quaternion[0]
+
+
 class TrajectoryRecorder:
     """Collects the true state tick by tick and keeps it at 50 Hz.
 

@@ -11,7 +11,7 @@ from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
@@ -40,7 +40,10 @@ from airl_mav.flight.setup import Setup
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.scenario.file import SCENARIO_FILE, save_scenario
 from airl_mav.scenario.model import free_fields
-from airl_mav.scenario.resolved import ResolvedScenario
+
+if TYPE_CHECKING:
+    # Whoever reads a run needs nothing of what resolves a scenario.
+    from airl_mav.scenario.resolved import ResolvedScenario
 
 SCHEMA = 1
 """Version of the folder's layout and of `run.json`."""

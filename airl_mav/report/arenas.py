@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena
-from airl_mav.arena.tours import set_out_later
 from airl_mav.core.errors import UsageError
 from airl_mav.core.plugins import GENERATORS, is_loaded, load_part
 from airl_mav.flight.record import NO_ARENA, EpisodeRecord
@@ -42,6 +40,17 @@ def check_trust(arena: str, spec: ArenaSpec) -> None:
         )
 
 
+def spec_of(arena: str) -> ArenaSpec:
+    """Return the profile of an arena that can be made here.
+
+    Raises:
+        UsageError: It cannot be found any more, or its generator is code that nobody asked for.
+    """
+    spec = load_profile("arenas", arena, ArenaSpec)
+    check_trust(arena, spec)
+    return spec
+
+
 def trust_arenas(run: LoadedRun) -> None:
     """Load the generators that a run's arenas name. Raises UsageError."""
     for arena in {record.arena for record in run.episodes} - {NO_ARENA}:
@@ -52,14 +61,17 @@ def trust_arenas(run: LoadedRun) -> None:
 
 def arenas_of(records: Iterable[EpisodeRecord], vehicle: VehicleProfile) -> dict[int, Arena]:
     """Make the arenas of those flights that have one, by episode index. Raises UsageError."""
+    # Imported here: a page can be served, and a wrong run refused, before numba is there.
+    from airl_mav.arena.generate import generate
+    from airl_mav.arena.tours import set_out_later
+
     specs: dict[str, ArenaSpec] = {}
     arenas: dict[int, Arena] = {}
     for record in records:
         if record.arena == NO_ARENA:
             continue
         if record.arena not in specs:
-            spec = specs[record.arena] = load_profile("arenas", record.arena, ArenaSpec)
-            check_trust(record.arena, spec)
+            specs[record.arena] = spec_of(record.arena)
         if record.index not in arenas:
             arena = generate(
                 specs[record.arena],

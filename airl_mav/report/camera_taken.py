@@ -16,10 +16,10 @@ from airl_mav.camera.render import Motion, Mount, camera_pose
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import quat_to_matrix
+from airl_mav.flight.trajectory import pose_at
 from airl_mav.profiles.camera import Camera
 from airl_mav.report.camera_pictures import Pixels
 from airl_mav.report.depth_colours import coloured
-from airl_mav.report.forensics.camera_view import pose_at
 from airl_mav.report.replay.flight import ReplayedFlight
 
 TURNED_OVER_US = 20_000

@@ -24,7 +24,7 @@ from airl_mav.core.files import Arrays
 from airl_mav.core.goals import Goal
 from airl_mav.core.plugins import names_code
 from airl_mav.flight.record import EpisodeRecord
-from airl_mav.flight.trajectory import Trajectory
+from airl_mav.flight.trajectory import Trajectory, pose_at
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.policy.action_sets import commands, discrete_actions
 from airl_mav.policy.layouts import encode_layout
@@ -43,7 +43,7 @@ from airl_mav.prediction.compensator import Compensator
 from airl_mav.prediction.memory import DecisionMemory
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import LoadedRun, RunInfo
-from airl_mav.report.forensics.camera_view import PolicyCamera, pose_at
+from airl_mav.report.forensics.camera_view import PolicyCamera
 
 ONE = np.zeros(1, np.intp)
 

@@ -11,7 +11,6 @@ import tomli_w
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import replace_file
 from airl_mav.core.plugins import names_file
-from airl_mav.policy.registry import policy_names
 from airl_mav.scenario.model import Scenario
 
 if sys.version_info >= (3, 11):
@@ -41,6 +40,9 @@ def save_scenario(scenario: Scenario, path: Path) -> None:
 
 def anchored(scenario: Scenario) -> Scenario:
     """Return a scenario whose paths are absolute: they mean the same wherever it is flown again."""
+    # Imported here: whoever only reads a command line or a run folder needs no policy.
+    from airl_mav.policy.registry import policy_names
+
     policy, latency = scenario.policy, scenario.latency or ""
     named = {name: getattr(scenario, name) for name in ("vehicle", "arena", "computer")}
     paths = {name: value for name, value in named.items() if value.endswith(".toml")}

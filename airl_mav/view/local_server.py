@@ -8,16 +8,36 @@ the view could pause flights, change their latency, or show them to the internet
 from __future__ import annotations
 
 import re
-from functools import partial
+from collections.abc import Callable
 from typing import Any
 
 import viser
 import websockets.asyncio.server
+from websockets.asyncio.server import ServerConnection
+from websockets.http11 import Request, Response
 
 from airl_mav.core.ports import LOOPBACK
 
 OWN_PAGES = [re.compile(r"http://(127\.0\.0\.1|localhost)(:\d+)?"), None]
 """Whose pages may connect: those that this computer serves, and programs, which name no origin."""
+
+Answering = Callable[[ServerConnection, Request], Response | None]
+"""Answers a request, or leaves it to the WebSocket: None."""
+
+
+def uncompressed(answering: Answering) -> Answering:
+    """Return the same without compression.
+
+    viser's page is compressed as it lies on the disk: once more takes longer than it saves on the
+    way to a browser of the same computer.
+    """
+
+    def answer(connection: ServerConnection, request: Request) -> Response | None:
+        if "Accept-Encoding" in request.headers:
+            del request.headers["Accept-Encoding"]
+        return answering(connection, request)
+
+    return answer
 
 
 class LocalServer(viser.ViserServer):
@@ -27,8 +47,13 @@ class LocalServer(viser.ViserServer):
         """Serve on a port, 0 for a free one; where it is taken, on another."""
         module: Any = websockets.asyncio.server
         serve = module.serve
+
+        def serve_locally(*words: Any, process_request: Answering, **more: Any) -> Any:
+            answering = uncompressed(process_request)
+            return serve(*words, origins=OWN_PAGES, process_request=answering, **more)
+
         # viser has no option for it. It listens before its constructor returns.
-        module.serve = partial(serve, origins=OWN_PAGES)
+        module.serve = serve_locally
         try:
             super().__init__(LOOPBACK, port, verbose=False)
         finally:

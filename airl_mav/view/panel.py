@@ -54,7 +54,8 @@ class Panel:
         self._title = gui.add_html(title_html(Shown(), run))
         head()
         self._numbers = gui.add_html(numbers_html(Shown()))
-        self._picture = gui.add_image(BLANK, label=image, format="png")
+        self._gui, self._label = gui, image
+        self._picture: Any = None
         with gui.add_folder("Latency"):
             self._strip = _new_strip(gui)
             latency()
@@ -63,15 +64,22 @@ class Panel:
         self._decisions = 0
         self._is_blank = True
 
+    def draw_title(self, shown: Shown) -> None:
+        """Show what flies."""
+        if self._title.content != (title := title_html(shown, self._run)):
+            self._title.content = title
+
     def draw(self, shown: Shown) -> None:
         """Show the numbers, texts and images of the moment; what has not changed is not sent."""
+        self.draw_title(shown)
         for element, text in (
-            (self._title, title_html(shown, self._run)),
             (self._numbers, numbers_html(shown)),
             (self._texts, texts_html(shown)),
         ):
             if element.content != text:
                 element.content = text
+        if self._picture is None:
+            self._add_picture()
         if shown.decisions != self._decisions:
             self._decisions = shown.decisions
             if shown.episode is None or shown.decided_image is None:
@@ -79,6 +87,15 @@ class Panel:
             else:
                 range_m = shown.episode.vehicle.camera_range_m
                 self._picture.image = camera_picture(shown.decided_image, range_m)
+
+    def _add_picture(self) -> None:
+        """Add the image, below the numbers.
+
+        Not as the panel is built: what encodes images takes longer to import than the rest of the
+        panel to be on a page.
+        """
+        order = self._numbers.order + 0.5
+        self._picture = self._gui.add_image(BLANK, label=self._label, format="png", order=order)
 
     def draw_strip(self, shown: Shown) -> None:
         """Show the latencies of the last seconds."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import html
 import math
 from collections.abc import Iterable
-from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +13,7 @@ from airl_mav.camera.frame import nearness, rgb_of
 from airl_mav.core.constants import US_PER_S
 from airl_mav.view.messages import Image
 from airl_mav.view.shown import Shown
+from airl_mav.view.viridis import VIRIDIS
 
 NO_RETURN = (38, 42, 48)
 """Colour of pixels that the camera has no depth of."""
@@ -37,21 +37,11 @@ def camera_picture(image: Image, range_m: float) -> NDArray[np.uint8]:
     if image.ndim == 3:
         picture = rgb_of(image)
     else:
-        picture = _colours()[(255.0 * nearness(image, range_m)).astype(np.uint8)]
+        picture = VIRIDIS[(255.0 * nearness(image, range_m)).astype(np.uint8)]
         picture[image == 0] = NO_RETURN
     times = max(1, math.ceil(LEAST_PX / picture.shape[1]))
     larger: NDArray[np.uint8] = np.kron(picture, np.ones((times, times, 1), np.uint8))
     return larger
-
-
-@cache
-def _colours() -> NDArray[np.uint8]:
-    """Return matplotlib's viridis as RGB (256, 3)."""
-    # Imported here: it takes half a second, in which a page can be opened.
-    from matplotlib import colormaps
-
-    colours: NDArray[np.uint8] = colormaps["viridis"](np.arange(256), bytes=True)[:, :3]
-    return colours
 
 
 def numbers_html(shown: Shown) -> str:

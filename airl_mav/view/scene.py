@@ -27,7 +27,6 @@ from airl_mav.core.frames import (
 from airl_mav.core.goals import goal_height_m
 from airl_mav.profiles.vehicle import CORNERS, COUNTER_CLOCKWISE
 from airl_mav.view.look import (
-    ARROW_S,
     BLADE,
     COMMANDED,
     DROP,
@@ -37,7 +36,6 @@ from airl_mav.view.look import (
     GOAL,
     GRID,
     HILLS,
-    LEAST_ARROW_M,
     MOVING,
     NOSE,
     OPEN,
@@ -48,6 +46,7 @@ from airl_mav.view.look import (
 )
 from airl_mav.view.messages import Episode, Vehicle, VehicleShape
 from airl_mav.view.pictures import camera_picture
+from airl_mav.view.shapes import arrow, segments_of, walls
 from airl_mav.view.shown import Shown
 
 FRUSTUM_M = 0.6
@@ -106,6 +105,7 @@ class FlightScene:
         if self._base is not None:
             self._base.remove()  # and all below it
         self._base = self._scene.add_frame(self._root, show_axes=False)
+        self._is_surrounded = False
         self._movers: list[Any] = []
         self._blades: list[Any] = []
         self._turns = np.zeros(4)
@@ -115,6 +115,10 @@ class FlightScene:
         self._picture: Any = None
 
     def _add(self, kind: str, name: str, *args: Any, **properties: Any) -> Any:
+        if kind == "box":
+            # Its corners have a normal for each side: it looks the same, and a page without a GPU
+            # has one shader fewer to compile before it shows anything.
+            properties["flat_shading"] = False
         return getattr(self._scene, f"add_{kind}")(f"{self._root}{name}", *args, **properties)
 
     def draw(self, shown: Shown, *, picture: bool) -> None:
@@ -126,7 +130,10 @@ class FlightScene:
             if shown.episodes != self._drawn:
                 self._drawn = shown.episodes
                 self._reset()
-                self._build(episode, shown.arena)
+                self._build(episode)
+            if shown.is_surrounded and not self._is_surrounded:
+                self._is_surrounded = True
+                self._surround(episode, shown.arena)
             if shown.vehicle is not None:
                 self._move(shown, shown.vehicle, episode)
         if picture:
@@ -140,13 +147,17 @@ class FlightScene:
 
     # --- once an episode
 
-    def _build(self, episode: Episode, arena: Arena | None) -> None:
+    def _surround(self, episode: Episode, arena: Arena | None) -> None:
+        """Build what stands around the flight."""
         if self._look.whole:
             bounds = OPEN if arena is None else arena.bounds
             self._build_floor(bounds)
             self._build_ends(episode, 0.6 * bounds.height, _below(arena, episode.goal))
             if arena is not None:
                 self._build_arena(arena)
+
+    def _build(self, episode: Episode) -> None:
+        """Build what flies."""
         self._build_vehicle(episode.vehicle)
         none = np.zeros((0, 2, 3), np.float32)
         # At the vehicle's place, by a message of the same kind: they move with it, not behind it.
@@ -384,38 +395,3 @@ def _below(arena: Arena | None, place: Sequence[float]) -> float:
     if arena is None or arena.ground is None:
         return 0.0
     return arena.ground.height_at(place[0], place[1])
-
-
-def walls(bounds: Bounds) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
-    """Return the four walls, and the ceiling where there is one, as a mesh whose front is inside.
-
-    Returns:
-        Corners (8, 3) NED [m], and the corners of the triangles (8 or 10, 3).
-    """
-    b = bounds
-    ends = [
-        (b.north_max, b.east_min),
-        (b.north_max, b.east_max),
-        (b.north_min, b.east_max),
-        (b.north_min, b.east_min),
-    ]
-    corners = [(*end, height) for height in (0.0, -b.height) for end in ends]
-    faces = []
-    for here, after in ((0, 1), (1, 2), (2, 3), (3, 0)):
-        faces += [(here, after, after + 4), (here, after + 4, here + 4)]
-    if b.ceiling:
-        faces += [(4, 5, 6), (4, 6, 7)]
-    return np.array(corners, np.float32), np.array(faces, np.uint32)
-
-
-def arrow(velocity: Floats | None) -> NDArray[np.float32]:
-    """Return the arrow (n, 2, 3) of a velocity (3,) [m/s], from the origin [m]; n = 0: none."""
-    if velocity is None or np.linalg.norm(velocity) * ARROW_S < LEAST_ARROW_M:
-        return np.zeros((0, 2, 3), np.float32)
-    return np.array([[np.zeros(3), ARROW_S * velocity]], np.float32)
-
-
-def segments_of(points: list[tuple[float, float, float]]) -> NDArray[np.float32]:
-    """Return the segments (n - 1, 2, 3) of a line through n points."""
-    line = np.array(points, np.float32)
-    return np.stack([line[:-1], line[1:]], axis=1)

@@ -49,6 +49,8 @@ class Shown:
     texts: deque[Said] = field(default_factory=lambda: deque(maxlen=TEXTS))
     episode: Episode | None = None
     arena: Arena | None = None
+    is_surrounded: bool = True
+    """Whether it is known what stands around: not while an arena is being made."""
     episodes: int = 0
     """How many episodes have begun so far: another number is another scene."""
     vehicle: Vehicle | None = None

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena, Bounds
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.render import render
 from airl_mav.core.frames import quat_from_euler
 
 AHEAD = Intrinsics(width=1, height=1, focal=1.0, cx=0.0, cy=0.0)
@@ -41,6 +40,9 @@ def unhidden(
     Returns:
         `offset`, or the part of it that ends before the first obstacle.
     """
+    # Imported here: without numba a view has its page ready sooner than a browser opens it.
+    from airl_mav.camera.render import render
+
     away = float(np.linalg.norm(offset))
     if away <= NEAREST_M:
         return offset

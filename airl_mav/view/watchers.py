@@ -54,12 +54,19 @@ class Watchers:
         """Whether anybody watches."""
         return bool(self._server.get_clients())
 
+    def expect(self, shown: Shown) -> None:
+        """Let pages that open from now on begin with the vehicle in sight, not somewhere else."""
+        if shown.vehicle is None:
+            return
+        at = np.array(shown.vehicle.position)
+        begin = self._server.initial_camera
+        begin.position, begin.look_at = at + _in_sight(shown, CHASE), at
+
     def follow(self, shown: Shown) -> None:
         """Move the cameras that follow along with the vehicle, in front of what would hide it."""
-        vehicle, episode, arena = shown.vehicle, shown.episode, shown.arena
-        if vehicle is None or episode is None:
+        if shown.vehicle is None:
             return
-        at = np.array(vehicle.position)
+        at = np.array(shown.vehicle.position)
         for number, client in self._server.get_clients().items():
             switch, camera = self._following.get(number), client.camera
             if switch is None or not switch.value:
@@ -67,9 +74,7 @@ class Watchers:
             slim = camera.image_height > SLIM * camera.image_width
             aim = at + BELOW if slim else at
             asked = self._asked_by(number, camera.position - camera.look_at)
-            offset = asked
-            if arena is not None:
-                offset = unhidden(arena, vehicle.time_us - episode.started_us, at, asked)
+            offset = _in_sight(shown, asked)
             self._put[number].append(offset)
             with client.atomic():
                 camera.position = aim + offset
@@ -94,3 +99,12 @@ class Watchers:
         self._put.pop(client.client_id, None)
         if not self.there:
             self._deserted()
+
+
+def _in_sight(shown: Shown, asked: Floats) -> Floats:
+    """Return where a camera is put that was asked for somewhere, from the vehicle NED [m]."""
+    vehicle, episode, arena = shown.vehicle, shown.episode, shown.arena
+    if vehicle is None or episode is None or arena is None:
+        return asked
+    at = np.array(vehicle.position)
+    return unhidden(arena, vehicle.time_us - episode.started_us, at, asked)

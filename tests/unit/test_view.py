@@ -6,14 +6,16 @@ import socket
 import threading
 from collections import deque
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import replace
+from http.client import HTTPConnection
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib import colormaps
 
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape, Tour
@@ -49,6 +51,7 @@ from airl_mav.view.pace import Pace
 from airl_mav.view.pictures import NO_RETURN, camera_picture, numbers_html, texts_html
 from airl_mav.view.shown import STRIP_S, Shown
 from airl_mav.view.viewer import Viewer, request_of
+from airl_mav.view.viridis import VIRIDIS
 from tests.support.ports import free_ports
 from tests.support.processes import run_alone, wait_until
 
@@ -250,6 +253,11 @@ def test_near_is_bright_and_nothing_is_dark() -> None:
     assert int(near.sum()) > int(far.sum()) + 100
 
 
+def test_depth_has_the_colours_of_matplotlib() -> None:
+    theirs = colormaps["viridis"](np.arange(256), bytes=True)[:, :3]
+    np.testing.assert_array_equal(VIRIDIS, theirs)
+
+
 def test_numbers_and_texts_are_told_and_escaped() -> None:
     shown = Shown()
     shown.take(episode(), None)
@@ -376,6 +384,22 @@ def test_pages_of_other_sites_are_turned_away(origin: str | None, taken: bool) -
                 max_size=None,
             ) as socket:
                 assert socket.recv(timeout=20)
+    finally:
+        server.stop()
+
+
+@pytest.mark.parametrize("headers", [{}, {"Accept-Encoding": "gzip, br"}])
+def test_the_page_is_not_compressed_once_more(headers: dict[str, str]) -> None:
+    pytest.importorskip("viser")
+    from airl_mav.view.local_server import LocalServer
+
+    server = LocalServer(0)
+    try:
+        with closing(HTTPConnection("127.0.0.1", server.get_port(), timeout=20.0)) as connection:
+            connection.request("GET", "/", headers=headers)
+            reply = connection.getresponse()
+            assert reply.headers["Content-Encoding"] == "identity"
+            assert reply.read().lstrip().startswith(b"<!doctype html>")
     finally:
         server.stop()
 
@@ -566,7 +590,7 @@ def test_hills_are_told_and_shown_as_they_are() -> None:
 
 def test_walls_are_seen_from_inside() -> None:
     pytest.importorskip("viser")
-    from airl_mav.view.scene import walls
+    from airl_mav.view.shapes import walls
 
     inside = np.array([10.0, 0.0, -2.0])
     for ceiling, count in ((False, 8), (True, 10)):

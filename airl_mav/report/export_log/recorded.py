@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from airl_mav.black_box.messages import Decision
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.goals import goal_distance_m
-from airl_mav.flight.trajectory import Trajectory
+from airl_mav.flight.trajectory import Trajectory, pose_at
 from airl_mav.latency.stamps import NO_STAMP, STAMPS
 from airl_mav.rehearsal.run_folder import RunInfo
-from airl_mav.report.forensics.camera_view import pose_at
 from airl_mav.report.replay.flight import ReplayedFlight
 from airl_mav.vehicle.battery import drain, open_circuit, terminal_voltage
 

@@ -14,7 +14,7 @@ from airl_mav.camera.colour import RANGE_M
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import Mount, camera_pose, render
 from airl_mav.control.attitude import heading_of
-from airl_mav.flight.trajectory import Trajectory
+from airl_mav.flight.trajectory import Trajectory, pose_at
 from airl_mav.profiles.camera import Camera
 
 Floats = NDArray[np.float64]
@@ -60,13 +60,6 @@ class ObstacleView:
     """Part of the picture that showed the obstacle, 0 to 1; None for a wall or the floor."""
     hidden: bool
     """The obstacle would have been in the picture, but something nearer covered all of it."""
-
-
-def pose_at(path: Trajectory, time_us: int) -> tuple[Floats, Floats, Floats]:
-    """Return position (3,), velocity (3,) and quaternion (4,), the nearest there is to a time."""
-    time = min(max(time_us, int(path.time_us[0])), int(path.time_us[-1]))
-    at = path.between(time, time)
-    return at.position[0], at.velocity[0], at.quaternion[0]
 
 
 def heading_rad(quaternion: Floats) -> float:

@@ -15,11 +15,11 @@ from airl_mav.arena.geometry import Arena
 from airl_mav.core.constants import US_PER_S
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.quality import measure_leg
+from airl_mav.flight.trajectory import pose_at
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.report.forensics.camera_view import (
     ObstacleView,
     bearing,
-    pose_at,
     view_obstacle,
     view_wall,
 )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,10 @@ from airl_mav.arena.geometry import Arena
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory
-from airl_mav.report.forensics.camera_view import PolicyCamera
+
+if TYPE_CHECKING:
+    # Whoever ranks flights by their records draws no image.
+    from airl_mav.report.forensics.camera_view import PolicyCamera
 
 HALF_WIDTH_M = 0.3
 """Room that a vehicle takes to either side."""

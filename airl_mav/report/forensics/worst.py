@@ -26,6 +26,7 @@ from airl_mav.report.forensics.evidence import (
     time_lost_s,
     usual_flight,
 )
+from airl_mav.report.forensics.ranking import ranked
 from airl_mav.report.table import NONE, OUTCOME_LABELS, Column, TableView
 
 EXAMINED = 100
@@ -52,23 +53,6 @@ class ExaminedFlight:
     """Against the run's median pace over the same straight way [s]."""
     excess: float | None
     """Of the way flown over the straight one, as a fraction."""
-
-
-def ranked(run: LoadedRun) -> list[EpisodeRecord]:
-    """Return all flights, the worst first.
-
-    Those that failed come first, then those that reached the goal; each by the time they lost, or
-    took where no flight reached the goal.
-    """
-    usual = usual_flight(run.episodes)
-
-    def key(e: EpisodeRecord) -> tuple[bool, float, int]:
-        lost_s = time_lost_s(e, usual)
-        if lost_s is None:
-            lost_s = 0.0 if e.quality is None else e.quality.flight_time_s
-        return (e.outcome is Outcome.SUCCESS, -lost_s, e.index)
-
-    return sorted(run.episodes, key=key)
 
 
 def flown_path(run: LoadedRun, record: EpisodeRecord) -> Trajectory | None:

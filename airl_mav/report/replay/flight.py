@@ -10,14 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena
-from airl_mav.camera.exposure import expose
-from airl_mav.camera.render import camera_pose
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.files import Arrays
 from airl_mav.flight.record import EpisodeRecord
-from airl_mav.flight.trajectory import Trajectory
+from airl_mav.flight.trajectory import Trajectory, pose_at
 from airl_mav.profiles.vehicle import VehicleProfile
-from airl_mav.report.forensics.camera_view import PolicyCamera, pose_at
 from airl_mav.view.messages import (
     ArenaShown,
     Decided,
@@ -123,6 +120,11 @@ class ReplayedFlight:
         """Return what the camera saw at a time, without noise; None: no arena."""
         if self.arena is None:
             return None
+        # Imported here: with them comes numba, and a flight is shown before its arena.
+        from airl_mav.camera.exposure import expose
+        from airl_mav.camera.render import camera_pose
+        from airl_mav.report.forensics.camera_view import PolicyCamera
+
         camera = PolicyCamera.of(self.vehicle.camera)
         position, _, quaternion = pose_at(self.path, time_us)
         from_us = time_us - self.record.started_us
@@ -190,6 +192,7 @@ class ReplayedFlight:
         """Make `shown` this flight's, instead of another's."""
         record = self.record
         shown.take(self.episode, None)
+        shown.is_surrounded = True
         shown.flight = Flight(index=record.index, seed=record.seed, goal=record.goal)
         shown.trail = self.trail
         shown.texts.clear()
@@ -199,6 +202,12 @@ class ReplayedFlight:
             shown.texts.append(Said(time_us=None, severity=WARNING, text=note))
         how = f"{record.outcome.value}: {record.reason}"
         shown.texts.append(Said(time_us=record.ended_us, severity=INFO, text=how))
+
+    def surround(self, shown: Shown) -> None:
+        """Add the arena to `shown`, which began as this flight without it."""
+        shown.episode, shown.arena = self.episode, self.arena
+        shown.is_surrounded = True
+        shown.decided = None  # What the policy saw is shown with the next moment.
 
 
 def parting_s(first: ReplayedFlight, other: ReplayedFlight) -> float | None:

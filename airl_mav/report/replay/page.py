@@ -49,7 +49,7 @@ class ReplayPage:
         beside: ReplayedRun | None = None,
         first: EpisodeRecord | None = None,
     ) -> None:
-        """Build the page.
+        """Build the page, as it is at the beginning of the first flight.
 
         Args:
             server: Whose.
@@ -79,7 +79,9 @@ class ReplayPage:
         self._glides_s = 0.0
         """In how much time the scene is there [wall s]; 0: it does not follow it."""
         self._drawn = 0
-        self._choose(first or run.records[0])
+        self._other: ReplayedFlight | None = None
+        """What flies beside."""
+        self._open(run.way(first or run.records[0]))
 
     def _add_head(self) -> None:
         gui = self._gui
@@ -116,11 +118,37 @@ class ReplayPage:
 
     # --- where it is
 
+    def _open(self, way: ReplayedFlight) -> None:
+        """Show a flight first as it flew, then with its arena, which takes a while to be made.
+
+        Whoever opens the page finds all that there is by then, without asking for it.
+        """
+        self._flight: ReplayedFlight = way
+        way.begin(self._shown)
+        self._shown.is_surrounded = False
+        self._go_to(self._begin_s())
+        way.show(self._shown, self._seconds)
+        self._scene.draw(self._shown, picture=False)
+        self._watchers.expect(self._shown)
+        self._panel.draw_title(self._shown)
+        flight = self._run.flight(way.record)
+        if self._flight is way:  # Nobody has chosen another one meanwhile.
+            self._flight = flight
+            flight.surround(self._shown)
+            self._accompany(way.record)
+            self.draw()
+
     def _choose(self, record: EpisodeRecord) -> None:
         """Show another flight, from its beginning."""
-        self._flight: ReplayedFlight = self._run.flight(record)
-        self._other = None if self._beside is None else self._beside.same(record)
+        self._flight = self._run.flight(record)
         self._flight.begin(self._shown)
+        self._accompany(record)
+
+    def _accompany(self, record: EpisodeRecord) -> None:
+        """Let the other run's flight fly beside, and set the panel to their beginning."""
+        self._other = None
+        if self._beside is not None and (same := self._beside.same(record)) is not None:
+            self._other = self._beside.flight(same)
         self._others = Shown()
         if self._other is not None:
             self._other.begin(self._others)

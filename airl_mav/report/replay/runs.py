@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 from airl_mav.core.errors import FieldError, UsageError
-from airl_mav.flight.record import EpisodeRecord
+from airl_mav.flight.record import NO_ARENA, EpisodeRecord
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import LoadedRun, load
-from airl_mav.report.arenas import arenas_of, vehicle_of
-from airl_mav.report.forensics.worst import ranked
+from airl_mav.report.arenas import arenas_of, spec_of, vehicle_of
+from airl_mav.report.forensics.ranking import ranked
 from airl_mav.report.replay.flight import ReplayedFlight
 
 
@@ -44,25 +45,35 @@ class ReplayedRun:
             raise FieldError("flight", index, f"{numbers[0]} to {numbers[-1]}, as far as recorded")
         return found
 
+    def check(self, record: EpisodeRecord) -> None:
+        """Raise UsageError unless the arena of a flight can be made."""
+        if record.arena != NO_ARENA:
+            spec_of(record.arena)
+
+    def way(self, record: EpisodeRecord) -> ReplayedFlight:
+        """Return a flight without its arena, which takes longer to make than all the rest."""
+        index, run = record.index, self._run
+        return ReplayedFlight(
+            record,
+            run.trajectories[index],
+            run.latency.get(index, {}),
+            None,
+            self._vehicle,
+            bool(run.info.config.get("pilot", {}).get("compensate")),
+        )
+
     def flight(self, record: EpisodeRecord) -> ReplayedFlight:
         """Return a flight. Raises UsageError where its arena cannot be made any more."""
         index = record.index
         if index not in self._made:
-            run = self._run
-            self._made[index] = ReplayedFlight(
-                record,
-                run.trajectories[index],
-                run.latency.get(index, {}),
-                arenas_of([record], self._vehicle).get(index),
-                self._vehicle,
-                bool(run.info.config.get("pilot", {}).get("compensate")),
-            )
+            arena = arenas_of([record], self._vehicle).get(index)
+            self._made[index] = replace(self.way(record), arena=arena)
         return self._made[index]
 
-    def same(self, record: EpisodeRecord) -> ReplayedFlight | None:
+    def same(self, record: EpisodeRecord) -> EpisodeRecord | None:
         """Return the flight of the same seed and arena as another run's; None: there is none."""
         key = (record.seed, record.arena, record.arena_seed, record.zone)
         for each in self.records:
             if (each.seed, each.arena, each.arena_seed, each.zone) == key:
-                return self.flight(each)
+                return each
         return None
