@@ -33,7 +33,7 @@ from airl_mav.training.onnx_export import (
     random_inputs,
     random_memory,
 )
-from airl_mav.training.recurrent import RecurrentNetwork, RecurrentOfSeveral
+from airl_mav.training.recurrent import RecurrentNetwork, RecurrentOfAny
 
 DEPTH = "depth"
 """Key of the image where the camera gives depth."""
@@ -96,6 +96,19 @@ class _AnyNetwork(nn.Module):
         return found
 
 
+class _ByName(nn.Module):
+    """From a Dict of observations to arguments of these names."""
+
+    def __init__(self, inner: nn.Module, names: Sequence[str]) -> None:
+        super().__init__()
+        self.inner = inner
+        self.names = tuple(names)
+
+    def forward(self, seen: dict[str, torch.Tensor]) -> torch.Tensor:
+        found: torch.Tensor = self.inner(*(seen[name] for name in self.names))
+        return found
+
+
 class _MeanOfQuantiles(nn.Module):
     """QR-DQN: the value of an action is the mean of its quantiles."""
 
@@ -124,30 +137,23 @@ class _Actor(nn.Module):
         return found
 
 
-def network_of(model: BaseAlgorithm) -> nn.Module:
+def network_of(model: BaseAlgorithm, keys: Sequence[str] = USUAL) -> nn.Module:
     """Return the part of a model that decides, as `export_network` takes it.
+
+    Args:
+        model: Any algorithm of stable-baselines3 or sb3-contrib.
+        keys: Of its layout's arrays, in their order.
 
     Raises:
         UsageError: The policy is of a kind that is not known.
     """
     policy: Any = model.policy
-    keys = tuple(sorted(policy.observation_space.spaces))
-    image = next((key for key in keys if key in KINDS), DEPTH)
-    usual = set(keys) == {image, *VECTORS}
-    further = _further_keys(policy.observation_space)
+    keys = tuple(keys)
     network: Callable[[nn.Module], nn.Module]
-    if usual or set(keys) == {image, *VECTORS, IN_FLIGHT}:
-        network = _Network if usual else _ToldNetwork
-        if image != DEPTH:
-            # In the order in which the layout has them.
-            told = () if usual else (IN_FLIGHT,)
-            network = partial(_AnyNetwork, keys=(image, *VECTORS, *told))
-    elif further and set(keys) - set(further) in (
-        {image, *VECTORS},
-        {image, *VECTORS, IN_FLIGHT},
-    ):
-        told = (IN_FLIGHT,) if IN_FLIGHT in keys else ()
-        network = partial(_AnyNetwork, keys=(image, *VECTORS, *told, *further))
+    if keys == USUAL:
+        network = _Network
+    elif keys == (*USUAL, IN_FLIGHT):
+        network = _ToldNetwork
     else:
         network = partial(_AnyNetwork, keys=keys)
     if hasattr(policy, "quantile_net"):
@@ -170,15 +176,11 @@ def network_of(model: BaseAlgorithm) -> nn.Module:
         hidden = policy.mlp_extractor.policy_net
         extractor = policy.pi_features_extractor
         if hasattr(policy, "lstm_actor"):
-            several = bool(further) and set(keys) == {image, *VECTORS, *further}
-            if not (usual or several):
-                raise UsageError(
-                    f"a network with a memory of its own takes {', '.join(keys)}; accepted:"
-                    f" {', '.join((image, *VECTORS))}"
-                )
             head = nn.Sequential(hidden, policy.action_net, last)
-            parts = (_Actor(policy, extractor), policy.lstm_actor, head, image)
-            return RecurrentOfSeveral(*parts, further) if several else RecurrentNetwork(*parts)
+            parts = (_Actor(policy, extractor), policy.lstm_actor, head)
+            if keys[1:] == VECTORS:
+                return RecurrentNetwork(*parts, keys[0])
+            return RecurrentOfAny(*parts, keys)
         return network(_Actor(policy, extractor, hidden, policy.action_net, last))
     raise UsageError(f"{type(model).__name__}: its {type(policy).__name__} cannot be exported")
 
@@ -209,6 +211,8 @@ def check_spaces(model: BaseAlgorithm, spec: ObservationSpec, actions: ActionSpe
         told = f"observation space {found}; accepted with this layout: {accepted}"
         if not spec.cameras and (others := _further_keys(seen)):
             told += f". What camera {', '.join(others)} is of is told by --like CONFIGURATION"
+        if not spec.in_flight and IN_FLIGHT in parts:
+            told += f". What {IN_FLIGHT} tells is told by --like CONFIGURATION"
         raise UsageError(told)
     space, count = model.action_space, discrete_actions(actions)
     if count is not None:
@@ -310,6 +314,10 @@ def load_module(name: str, weights: Path | None, keys: Sequence[str] = USUAL) ->
     ]
     # One argument: the Dict of observations, as in a training loop on the environment itself.
     if len(taken) != 1:
+        names = [each.name for each in taken]
+        if names != list(keys) and sorted(names) == sorted(keys):
+            # A layout of the user's has its arrays sorted; the module names them as it likes.
+            return _AnyNetwork(_ByName(module, names), keys)
         return module
     return _Network(module) if tuple(keys) == USUAL else _AnyNetwork(module, keys)
 
@@ -340,7 +348,7 @@ def export_sb3(
         UsageError: The model's spaces do not fit the facts, or it cannot be exported.
     """
     check_spaces(model, facts.observation, facts.actions)
-    network = network_of(model)
+    network = network_of(model, tuple(boxes(facts.observation)))
     training = model.policy.training
     model.policy.set_training_mode(False)
     try:

@@ -32,7 +32,7 @@ FLOWN = ("hold_s", "goal_radius_m", "altitude_m", "hover_after_s")
 
 SEEN = (
     *("layout", "frames", "kind", "projection", "horizontal_fov_deg", "distortion", "range_m"),
-    *("goal_height", "cameras"),
+    *("in_flight", "goal_height", "cameras"),
 )
 """What a policy sees but for the image's size: fields of the request and of a card."""
 
@@ -45,6 +45,7 @@ DEFAULTS: dict[str, Any] = {
     "horizontal_fov_deg": 90.0,
     "distortion": UNDISTORTED,
     "range_m": 20.0,
+    "in_flight": (),
     "goal_height": False,
     "cameras": {},
     "actions": "arc-25",
@@ -257,6 +258,7 @@ def _known_of(spec: EnvironmentSpec) -> dict[str, Any]:
         "horizontal_fov_deg": camera.horizontal_fov_deg,
         "distortion": camera.distortion,
         "range_m": camera.range_m,
+        "in_flight": spec.in_flight,
         "goal_height": spec.goal_height,
         "cameras": further_seen(spec, vehicle),
         "actions": spec.actions,
