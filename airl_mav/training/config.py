@@ -86,7 +86,7 @@ class NetworkSpec(ProfileModel):
         for name in ("layers", "filters"):
             if template == (getattr(self, name) is None):
                 raise ValueError(
-                    f"{name}: kind {self.kind!r} {'needs' if template else 'has no'} it"
+                    f"{name}: kind {self.kind!r} {'needs it' if template else 'has no such field'}"
                 )
         if self.strides is None:
             return self
