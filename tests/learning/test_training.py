@@ -218,7 +218,7 @@ def test_folders_are_not_mixed_up(short: Path, straight: Path, tmp_path: Path) -
         ("[environment.cameras.nose]\n", ["bad.toml: environment.cameras.nose: vehicle quad"]),
         (
             "[algorithm]\nname = 'a2c'\noptions = {n_steps = 'many'}\n",
-            ["algorithm.options", "'a2c'"],
+            ["bad.toml: algorithm.options.n_steps = 'many': accepted: 1 <= value"],
         ),
     ],
 )
