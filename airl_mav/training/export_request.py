@@ -86,6 +86,11 @@ class ExportRequest(BaseModel):
     weights: Path | None = Field(
         default=None, description="state_dict of a module of your own, as torch.save wrote it"
     )
+    vec_normalize: Path | None = Field(
+        default=None,
+        description="what the `save` of the VecNormalize around the training environment wrote, for"
+        " a .zip: its statistics become part of the network",
+    )
     like: str | None = Field(
         default=None,
         description="training configuration whose environment the model was made for, a shipped"
@@ -199,6 +204,8 @@ class ExportRequest(BaseModel):
             raise FieldError("algorithm", accepted="the class that wrote the .zip: DQN, PPO, ...")
         if self.weights is not None and not self.own_module:
             raise FieldError("weights", self.weights, "with a module of your own")
+        if self.vec_normalize is not None and self.own_module:
+            raise FieldError("vec_normalize", self.vec_normalize, "with a .zip")
         known: dict[str, Any] = {**DEFAULTS, **{k: v for k, v in _given(taken).items() if v}}
         environment = None if self.like is None else _environment(self.like)
         if environment is not None:

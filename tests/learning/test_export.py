@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+import pickle
 import re
 import sys
 import warnings
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ pytest.importorskip("onnxscript", reason="needs the [train] extra")
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from stable_baselines3.dqn.policies import MultiInputPolicy
 from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
@@ -36,7 +38,7 @@ from airl_mav.profiles.computer import load_computer
 from airl_mav.training import onnx_export as export
 from airl_mav.training.export import export_sb3, network_of
 from airl_mav.training.onnx_export import random_inputs
-from tests.support.policy_kit import SPEC, export_tiny, facts, make_model, noise
+from tests.support.policy_kit import SPEC, Nowhere, export_tiny, facts, make_model, noise
 from tests.support.processes import ROOT
 
 ONE = (
@@ -470,6 +472,80 @@ def test_a_foreign_continuous_model_and_the_paper_layout(
         airl(monkeypatch, "export", tmp_path / "paper.zip", "--out", tmp_path / "p", *layout) == 0
     )
     assert load_card(tmp_path / "p").observation == paper
+
+
+def normalised(keys: Sequence[str], **options: Any) -> VecNormalize:
+    """A VecNormalize that has seen something."""
+    space: spaces.Space[Any] = spaces.Discrete(25)
+    env = VecNormalize(
+        DummyVecEnv([lambda: Nowhere(SPEC, space)]), norm_obs_keys=list(keys), **options
+    )
+    rng = np.random.default_rng(3)
+    for key in keys if env.norm_obs else ():
+        env.obs_rms[key].update(rng.normal(1.0, 0.5, (50, 3)))
+    return env
+
+
+@pytest.mark.parametrize("algorithm", ["DQN", "RecurrentPPO"])
+def test_what_a_vec_normalize_did_becomes_part_of_the_network(
+    algorithm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    env = normalised(["velocity", "goal"], clip_obs=2.5)
+    env.save(str(tmp_path / "vecnormalize.pkl"))
+    options: dict[str, Any] = {"n_steps": 8} if algorithm == "RecurrentPPO" else {}
+    model = make_model(algorithm, **options)
+    model.save(tmp_path / "model.zip")
+    words = ("export", tmp_path / "model.zip", "--algorithm", algorithm, "--out", tmp_path / "p")
+    given = ("--vec-normalize", tmp_path / "vecnormalize.pkl")
+    assert airl(monkeypatch, *words, *given) == 0
+    seen = noise(100)
+    shown: Any = env.normalize_obs(dict(seen))
+    assert (np.abs(shown["velocity"]) == 2.5).any(), "some are cut off"
+    wanted, _ = model.predict(shown, deterministic=True)
+    without, _ = model.predict(seen, deterministic=True)
+    assert (wanted != without).any()
+    compare(load_learned(tmp_path / "p").act_batch(seen), wanted)
+
+
+def test_a_vec_normalize_of_rewards_alone_changes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    normalised([], norm_obs=False).save(str(tmp_path / "vecnormalize.pkl"))
+    make_model("DQN").save(tmp_path / "model.zip")
+    words = ("export", tmp_path / "model.zip", "--algorithm", "DQN", "--out")
+    given = ("--vec-normalize", tmp_path / "vecnormalize.pkl")
+    assert airl(monkeypatch, *words, tmp_path / "with", *given) == 0
+    assert airl(monkeypatch, *words, tmp_path / "without") == 0
+    assert read_card(tmp_path / "with").sha256 == read_card(tmp_path / "without").sha256
+
+
+@pytest.mark.parametrize(
+    ("model", "file", "line"),
+    [
+        ("model.zip", "absent.pkl", "--vec-normalize absent.pkl: no such file"),
+        ("model.zip", "model.zip", "--vec-normalize model.zip: no VecNormalize: "),
+        ("model.zip", "other.pkl", "--vec-normalize other.pkl: accepted: what a VecNormalize of"),
+        ("nets.py:Net", "other.pkl", "--vec-normalize other.pkl: accepted: with a .zip"),
+        ("static-obstacles", "other.pkl", "--vec-normalize other.pkl: accepted: of a policy that"),
+    ],
+)
+def test_what_is_no_vec_normalize_is_refused_in_one_line(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    model: str,
+    file: str,
+    line: str,
+) -> None:
+    make_model("DQN").save(tmp_path / "model.zip")
+    (tmp_path / "nets.py").write_text(NETS)
+    (tmp_path / "other.pkl").write_bytes(pickle.dumps([1, 2]))
+    monkeypatch.chdir(tmp_path)
+    words = ("--algorithm", "DQN") if model == "model.zip" else ()
+    assert airl(monkeypatch, "export", model, "--vec-normalize", file, "--out", "p", *words) == 2
+    (told,) = capsys.readouterr().err.splitlines()
+    assert line in told
+    assert not (tmp_path / "p").exists()
 
 
 TOLD = """
