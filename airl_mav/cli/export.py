@@ -27,8 +27,9 @@ class ExportOptions(ExportRequest):
     The model must take a Dict of the image (`depth`, `rgb` or `grey`, uint8), `velocity` and
     `goal`, as `--layout`, `--image` and `--kind` say, and give the actions of `--actions`; a module
     of your own may take the three as arguments. What a VecNormalize around the training environment
-    did is not in a .zip: such models do not fly right. A .zip holds pickled Python objects, and a
-    module is code: export only those of people you trust.
+    did to observations is not in a .zip: name its file with --vec-normalize, or the model does not
+    fly right. Both hold pickled Python objects, and a module is code: export only those of people
+    you trust.
 
     Examples:
         airl export model.zip --algorithm PPO --out policies/mine

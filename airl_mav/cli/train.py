@@ -17,7 +17,7 @@ from airl_mav.cli.options import POSITIONAL
 from airl_mav.cli.telling import Telling, Voice
 from airl_mav.cli.viewing import Viewing, view_of
 from airl_mav.core.compiling import COMPILING, heard_compiling
-from airl_mav.core.errors import EXIT_INTERRUPTED, UsageError
+from airl_mav.core.errors import EXIT_INTERRUPTED, FieldError, UsageError
 from airl_mav.training.progress import Exported, TrainingBar
 from airl_mav.training.request import TrainRequest
 
@@ -90,6 +90,8 @@ def run(
                     command=command_line or shlex.join(["airl", *sys.argv[1:]]),
                     view=None if viewer is None else viewer.ends,
                 )
+        except FieldError as error:  # It is the file's, not an option's.
+            raise UsageError(f"{options.config}: {error.line(sign=' = ')}") from None
         except KeyboardInterrupt:
             show(f"interrupted: airl train {options.config} --out {out} --resume continues")
             voice.finish(EXIT_INTERRUPTED, "interrupted", out)

@@ -25,6 +25,9 @@ FIRST_TRAINING_SEED = 1_000_000
 
 LAST_TRAINING_SEED = 2**31
 
+MOST_SEED = 2**63 - 1
+"""Greatest seed of an episode."""
+
 _FREE = Costs()
 """Nothing is charged."""
 
@@ -80,12 +83,23 @@ class Decisions:
             self._before = before.with_rows(slots, self.navigation.flights(slots))
         return self._before
 
-    def _decide(self, actions: NDArray[Any]) -> Decided:
-        """Fly one decision of every vehicle. Raises ResetNeeded before the first reset."""
+    def _decide(self, actions: Any, lead: tuple[int, ...]) -> Decided:
+        """Fly one decision of every vehicle.
+
+        Args:
+            actions: One, or n of them.
+            lead: () of one, (n,) of n.
+
+        Raises:
+            ResetNeeded: Before the first reset.
+            InvalidAction: Not so many actions of the set.
+        """
         before, spec = self._before, self.environment
         if before is None:
             raise gym.error.ResetNeeded("step() before reset()")
-        chosen = commands(spec.action_spec, actions)
+        action_spec = spec.action_spec
+        asked = checked_actions(action_spec, actions, lead)
+        chosen = commands(action_spec, asked if lead else asked[None])
         charged = spec.costs != _FREE
         level = chosen[:, :3]
         last = self.navigation.whole_truth().fleet.setpoint[:, (0, 1, 3)] if charged else level
@@ -143,6 +157,37 @@ def action_space(spec: ActionSpec) -> gym.Space[Any]:
     return gym.spaces.Box(-1.0, 1.0, (continuous_numbers(spec),), np.float32)
 
 
+def checked_actions(spec: ActionSpec, actions: Any, lead: tuple[int, ...]) -> NDArray[Any]:
+    """Return actions as an array, if they are such of a set.
+
+    What a continuous set would cut off, -1..1, is left to it.
+
+    Args:
+        spec: The action set.
+        actions: One, or n of them.
+        lead: () of one, (n,) of n.
+
+    Raises:
+        InvalidAction: Another shape or type, no number, a whole number that the set does not have.
+    """
+    number = discrete_actions(spec)
+    asked = np.asarray(actions)
+    shape = lead if number is not None else (*lead, continuous_numbers(spec))
+    if asked.shape != shape:
+        raise gym.error.InvalidAction(f"action of shape {asked.shape}: accepted: {shape}")
+    if asked.dtype.kind not in ("iu" if number is not None else "iuf"):
+        what = "whole numbers" if number is not None else "numbers"
+        raise gym.error.InvalidAction(f"action of type {asked.dtype}: accepted: {what}")
+    # Not in the set: numpy would take a negative one from its end, and what is no number would fly.
+    if number is not None:
+        wrong, accepted = (asked < 0) | (asked >= number), f"0 <= value <= {number - 1}"
+    else:
+        wrong, accepted = np.isnan(asked), "numbers, -1 to 1"
+    if wrong.any():
+        raise gym.error.InvalidAction(f"action {asked[wrong][0]}: accepted: {accepted}")
+    return asked
+
+
 def zone_option(options: Mapping[str, Any] | None) -> int | None:
     """Return the zone that `reset` is asked for. Raises UsageError for anything else."""
     options = options or {}
@@ -152,6 +197,13 @@ def zone_option(options: Mapping[str, Any] | None) -> int | None:
     if zone is not None and (isinstance(zone, bool) or not isinstance(zone, int | np.integer)):
         raise UsageError(f"options: zone = {zone!r}: accepted: a whole number")
     return None if zone is None else int(zone)
+
+
+def episode_seed(seed: Any) -> int:
+    """Return the seed of an episode as a number of Python. Raises UsageError."""
+    if not isinstance(seed, int | np.integer) or not 0 <= seed <= MOST_SEED:
+        raise UsageError(f"seed = {seed!r}: accepted: a whole number, 0 to 2^63 - 1")
+    return int(seed)
 
 
 def draw_seeds(rng: np.random.Generator, n: int) -> list[int]:

@@ -13,6 +13,7 @@ from airl_mav.envs.decisions import (
     Decisions,
     action_space,
     draw_seeds,
+    episode_seed,
     observation_space,
     outcome,
     zone_option,
@@ -82,21 +83,27 @@ class NavigationEnv(Decisions, gym.Env[Encoded, Any]):
                 whole arena.
 
         Raises:
-            UsageError: A wrong option, or no arena can be made of the seed.
+            UsageError: A wrong option or seed, or no arena can be made of the seed.
+            gymnasium.error.Error: The seed is negative, or no whole number of Python.
         """
         if seed is not None or options:
             self._zone = zone_option(options)
         super().reset(seed=seed)
-        episode = draw_seeds(self.np_random, 1)[0] if seed is None else seed
+        episode = draw_seeds(self.np_random, 1)[0] if seed is None else episode_seed(seed)
         flights = self._begin([0], [episode])
         self._trail = []
         return self._observe(), self._info(flights)
 
     def step(self, action: Any) -> tuple[Encoded, float, bool, bool, dict[str, Any]]:
-        """Fly one decision; see Gymnasium's Env.step."""
+        """Fly one decision; see Gymnasium's Env.step.
+
+        Raises:
+            ResetNeeded: No episode has begun, or it has ended.
+            InvalidAction: The action is none of the set; numbers beyond -1..1 are cut off.
+        """
         if self._before is not None and self._before.verdict[0] != Verdict.FLYING:
             raise gym.error.ResetNeeded("step() after the end of the episode")
-        now, reward, terminated, truncated = self._decide(np.asarray(action)[None])
+        now, reward, terminated, truncated = self._decide(action, ())
         info = self._info(now)
         if terminated[0] or truncated[0]:
             info |= outcome(now, 0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from copy import deepcopy
 from typing import Any
 
@@ -16,6 +16,7 @@ from airl_mav.envs.decisions import (
     Decisions,
     action_space,
     draw_seeds,
+    episode_seed,
     observation_space,
     outcome,
     zone_option,
@@ -98,7 +99,8 @@ class NavigationVectorEnv(Decisions, Stateful, VectorEnv[Encoded, NDArray[Any], 
             options: `zone`, as in `NavigationEnv.reset`.
 
         Raises:
-            UsageError: A wrong option, or not n seeds.
+            UsageError: A wrong option or seed, or not n seeds.
+            gymnasium.error.Error: The one seed is negative.
         """
         if seed is not None or options:
             self._zone = zone_option(options)
@@ -106,7 +108,11 @@ class NavigationVectorEnv(Decisions, Stateful, VectorEnv[Encoded, NDArray[Any], 
         if seed is None or isinstance(seed, int | np.integer):
             super().reset(seed=None if seed is None else int(seed))
         else:
-            own = [None if each is None else int(each) for each in seed]
+            if isinstance(seed, str) or not isinstance(seed, Iterable):
+                raise UsageError(
+                    f"seed = {seed!r}: accepted: a whole number, or one for each environment"
+                )
+            own = [None if each is None else episode_seed(each) for each in seed]
             if len(own) != self.num_envs:
                 raise UsageError(f"seed: {len(own)} numbers; accepted: {self.num_envs}")
             if given := [each for each in own if each is not None]:
@@ -119,8 +125,13 @@ class NavigationVectorEnv(Decisions, Stateful, VectorEnv[Encoded, NDArray[Any], 
     def step(
         self, actions: NDArray[Any]
     ) -> tuple[Encoded, NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
-        """Fly one decision of every vehicle; see Gymnasium's VectorEnv.step."""
-        now, reward, terminated, truncated = self._decide(actions)
+        """Fly one decision of every vehicle; see Gymnasium's VectorEnv.step.
+
+        Raises:
+            ResetNeeded: No episodes have begun.
+            InvalidAction: Not n actions of the set; numbers beyond -1..1 are cut off.
+        """
+        now, reward, terminated, truncated = self._decide(actions, (self.num_envs,))
         seen = self.navigation.observe()
         ended = terminated | truncated
         final: dict[str, Any] = {}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import inspect
 import math
 from typing import Any
 
@@ -20,21 +19,11 @@ from airl_mav.training.config import (
     NetworkSpec,
     check_actions,
     check_fields,
-    check_names,
 )
 from airl_mav.training.networks import policy_arguments, to_channels_last
 from airl_mav.training.table import ALGORITHMS, Algorithm
 
 BATCH = ALGORITHMS["dqn"].batch
-
-NOT_OPTIONS = frozenset(
-    {"self", "policy", "env", "seed", "device", "verbose", "policy_kwargs", "tensorboard_log"}
-    | {"action_noise", "monitor_wrapper", "_init_setup_model", "learning_rate", "gamma"}
-    | {"batch_size", "buffer_size", "learning_starts"}
-    | {"replay_buffer_class", "replay_buffer_kwargs", "rollout_buffer_class"}
-    | {"rollout_buffer_kwargs", "optimize_memory_usage"}
-)
-"""Arguments of stable-baselines3 that come from elsewhere or cannot stand in a file."""
 
 ROLLOUT = 4096
 """Steps of all vehicles between two rounds of updates of `ppo` and `trpo`."""
@@ -61,7 +50,7 @@ def make_model(
     discrete = isinstance(vec_env.action_space, spaces.Discrete)
     check_fields(algorithm)
     check_actions(algorithm.name, "discrete" if discrete else "continuous")
-    arguments = _arguments(algorithm, row, learner, vec_env.num_envs)
+    arguments = _arguments(algorithm, row, vec_env.num_envs)
     network_arguments = policy_arguments(network)
     network_arguments |= {k: arguments.pop(k) for k in row.to_policy if k in arguments}
     try:
@@ -93,7 +82,7 @@ def _algorithm_class(name: str) -> Any:
         ) from None
 
 
-def _arguments(spec: AlgorithmSpec, row: Algorithm, learner: Any, vehicles: int) -> dict[str, Any]:
+def _arguments(spec: AlgorithmSpec, row: Algorithm, vehicles: int) -> dict[str, Any]:
     """Return the constructor's arguments, those of `options` included."""
     arguments = {argument: getattr(spec, name) for name, argument in row.fields.items()}
     if spec.learning_rate_final is not None:
@@ -105,9 +94,6 @@ def _arguments(spec: AlgorithmSpec, row: Algorithm, learner: Any, vehicles: int)
     arguments |= row.defaults
     if row.rollouts:
         arguments["n_steps"] = _rollout_steps(arguments["batch_size"], vehicles)
-    if row.options is None:
-        known = inspect.signature(learner.__init__).parameters
-        check_names(spec, [name for name in known if name not in NOT_OPTIONS])
     # A TOML list is what stable-baselines3 takes as a tuple.
     options = {k: tuple(v) if isinstance(v, list) else v for k, v in spec.options.items()}
     return arguments | options

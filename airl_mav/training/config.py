@@ -86,7 +86,7 @@ class NetworkSpec(ProfileModel):
         for name in ("layers", "filters"):
             if template == (getattr(self, name) is None):
                 raise ValueError(
-                    f"{name}: kind {self.kind!r} {'needs' if template else 'has no'} it"
+                    f"{name}: kind {self.kind!r} {'needs it' if template else 'has no such field'}"
                 )
         if self.strides is None:
             return self
@@ -152,15 +152,14 @@ class AlgorithmSpec(ProfileModel):
 
     @model_validator(mode="after")
     def _options_fit_the_algorithm(self) -> AlgorithmSpec:
-        row = ALGORITHMS[self.name]
-        if row.options is not None:
-            check_names(self, row.options.model_fields)
-            try:
-                validated(row.options, self.options)
-            except FieldError as error:
-                raise FieldError(
-                    f"algorithm.options.{error.field}", error.value, error.accepted, error.problem
-                ) from None
+        options = ALGORITHMS[self.name].options
+        check_names(self, options.model_fields)
+        try:
+            validated(options, self.options)
+        except FieldError as error:
+            raise FieldError(
+                f"algorithm.options.{error.field}", error.value, error.accepted, error.problem
+            ) from None
         return self
 
 

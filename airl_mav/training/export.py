@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -15,6 +15,7 @@ import torch
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.preprocessing import preprocess_obs
+from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
 from airl_mav.core.errors import FieldError, UsageError
@@ -26,6 +27,7 @@ from airl_mav.policy.observation_spec import ObservationSpec
 from airl_mav.policy.runtime import first_line
 from airl_mav.profiles.camera_kind import CHANNELS, KINDS
 from airl_mav.training.export_request import ExportRequest, Taken
+from airl_mav.training.normalised import Normalised, load_normalisation, normalised_keys
 from airl_mav.training.onnx_export import (
     TOLERANCE,
     export_network,
@@ -33,7 +35,7 @@ from airl_mav.training.onnx_export import (
     random_inputs,
     random_memory,
 )
-from airl_mav.training.recurrent import RecurrentNetwork, RecurrentOfSeveral
+from airl_mav.training.recurrent import RecurrentNetwork, RecurrentOfAny
 
 DEPTH = "depth"
 """Key of the image where the camera gives depth."""
@@ -96,6 +98,19 @@ class _AnyNetwork(nn.Module):
         return found
 
 
+class _ByName(nn.Module):
+    """From a Dict of observations to arguments of these names."""
+
+    def __init__(self, inner: nn.Module, names: Sequence[str]) -> None:
+        super().__init__()
+        self.inner = inner
+        self.names = tuple(names)
+
+    def forward(self, seen: dict[str, torch.Tensor]) -> torch.Tensor:
+        found: torch.Tensor = self.inner(*(seen[name] for name in self.names))
+        return found
+
+
 class _MeanOfQuantiles(nn.Module):
     """QR-DQN: the value of an action is the mean of its quantiles."""
 
@@ -124,32 +139,33 @@ class _Actor(nn.Module):
         return found
 
 
-def network_of(model: BaseAlgorithm) -> nn.Module:
+def network_of(
+    model: BaseAlgorithm, keys: Sequence[str] = USUAL, learned: VecNormalize | None = None
+) -> nn.Module:
     """Return the part of a model that decides, as `export_network` takes it.
+
+    Args:
+        model: Any algorithm of stable-baselines3 or sb3-contrib.
+        keys: Of its layout's arrays, in their order.
+        learned: The VecNormalize around its environment; None: there was none.
 
     Raises:
         UsageError: The policy is of a kind that is not known.
     """
     policy: Any = model.policy
-    keys = tuple(sorted(policy.observation_space.spaces))
-    image = next((key for key in keys if key in KINDS), DEPTH)
-    usual = set(keys) == {image, *VECTORS}
-    further = _further_keys(policy.observation_space)
-    network: Callable[[nn.Module], nn.Module]
-    if usual or set(keys) == {image, *VECTORS, IN_FLIGHT}:
-        network = _Network if usual else _ToldNetwork
-        if image != DEPTH:
-            # In the order in which the layout has them.
-            told = () if usual else (IN_FLIGHT,)
-            network = partial(_AnyNetwork, keys=(image, *VECTORS, *told))
-    elif further and set(keys) - set(further) in (
-        {image, *VECTORS},
-        {image, *VECTORS, IN_FLIGHT},
-    ):
-        told = (IN_FLIGHT,) if IN_FLIGHT in keys else ()
-        network = partial(_AnyNetwork, keys=(image, *VECTORS, *told, *further))
-    else:
-        network = partial(_AnyNetwork, keys=keys)
+    keys = tuple(keys)
+
+    def normalised(inner: nn.Module) -> nn.Module:
+        if learned is None or not normalised_keys(learned):
+            return inner
+        return Normalised(inner, learned)
+
+    def network(inner: nn.Module) -> nn.Module:
+        inner = normalised(inner)
+        if keys == USUAL:
+            return _Network(inner)
+        return _ToldNetwork(inner) if keys == (*USUAL, IN_FLIGHT) else _AnyNetwork(inner, keys)
+
     if hasattr(policy, "quantile_net"):
         return network(_MeanOfQuantiles(policy.quantile_net))
     if hasattr(policy, "q_net"):
@@ -170,15 +186,11 @@ def network_of(model: BaseAlgorithm) -> nn.Module:
         hidden = policy.mlp_extractor.policy_net
         extractor = policy.pi_features_extractor
         if hasattr(policy, "lstm_actor"):
-            several = bool(further) and set(keys) == {image, *VECTORS, *further}
-            if not (usual or several):
-                raise UsageError(
-                    f"a network with a memory of its own takes {', '.join(keys)}; accepted:"
-                    f" {', '.join((image, *VECTORS))}"
-                )
             head = nn.Sequential(hidden, policy.action_net, last)
-            parts = (_Actor(policy, extractor), policy.lstm_actor, head, image)
-            return RecurrentOfSeveral(*parts, further) if several else RecurrentNetwork(*parts)
+            parts = (normalised(_Actor(policy, extractor)), policy.lstm_actor, head)
+            if keys[1:] == VECTORS:
+                return RecurrentNetwork(*parts, keys[0])
+            return RecurrentOfAny(*parts, keys)
         return network(_Actor(policy, extractor, hidden, policy.action_net, last))
     raise UsageError(f"{type(model).__name__}: its {type(policy).__name__} cannot be exported")
 
@@ -190,13 +202,21 @@ def _further_keys(seen: spaces.Space[Any]) -> tuple[str, ...]:
     return tuple(sorted(key for key in found if key not in KINDS))
 
 
-def check_spaces(model: BaseAlgorithm, spec: ObservationSpec, actions: ActionSpec) -> None:
-    """Raise UsageError unless a model takes the arrays of a layout and gives an action set."""
+def check_spaces(
+    model: BaseAlgorithm,
+    spec: ObservationSpec,
+    actions: ActionSpec,
+    normalised: Collection[str] = (),
+) -> None:
+    """Raise UsageError unless a model takes the arrays of a layout and gives an action set.
+
+    Those of `normalised` keys have been floats when it saw them.
+    """
     seen = model.observation_space
     wanted = {key: (box.shape, box.dtype) for key, box in boxes(spec).items()}
     accepted = ", ".join(f"{k} {np.dtype(kind)} {shape}" for k, (shape, kind) in wanted.items())
     parts = dict(seen.spaces) if isinstance(seen, spaces.Dict) else {"not a Dict": seen}
-    images = {spec.kind, *spec.further_keys.values()}
+    images = {spec.kind, *spec.further_keys.values()}.difference(normalised)
     fits = parts.keys() == wanted.keys() and all(
         isinstance(part, spaces.Box)
         and part.shape == wanted[key][0]
@@ -209,6 +229,10 @@ def check_spaces(model: BaseAlgorithm, spec: ObservationSpec, actions: ActionSpe
         told = f"observation space {found}; accepted with this layout: {accepted}"
         if not spec.cameras and (others := _further_keys(seen)):
             told += f". What camera {', '.join(others)} is of is told by --like CONFIGURATION"
+        if any(part.dtype != np.uint8 for key, part in parts.items() if key in images):
+            told += ". What a VecNormalize made of them is told by --vec-normalize FILE"
+        if not spec.in_flight and IN_FLIGHT in parts:
+            told += f". What {IN_FLIGHT} tells is told by --like CONFIGURATION"
         raise UsageError(told)
     space, count = model.action_space, discrete_actions(actions)
     if count is not None:
@@ -256,7 +280,11 @@ def export(asked: ExportRequest, command: str) -> PolicyCard:
     else:
         learner = load_sb3(Path(asked.model), asked.algorithm or "")
         facts = asked.facts(command, taken_by(learner))
-        write = partial(export_sb3, learner, folder=out, with_torch=asked.with_torch)
+        path = asked.vec_normalize
+        learned = None if path is None else load_normalisation(path)
+        write = partial(
+            export_sb3, learner, folder=out, with_torch=asked.with_torch, learned=learned
+        )
     try:
         return write(facts)
     except UsageError as error:
@@ -310,6 +338,10 @@ def load_module(name: str, weights: Path | None, keys: Sequence[str] = USUAL) ->
     ]
     # One argument: the Dict of observations, as in a training loop on the environment itself.
     if len(taken) != 1:
+        names = [each.name for each in taken]
+        if names != list(keys) and sorted(names) == sorted(keys):
+            # A layout of the user's has its arrays sorted; the module names them as it likes.
+            return _AnyNetwork(_ByName(module, names), keys)
         return module
     return _Network(module) if tuple(keys) == USUAL else _AnyNetwork(module, keys)
 
@@ -326,7 +358,12 @@ def _load_weights(module: nn.Module, path: Path) -> None:
 
 
 def export_sb3(
-    model: BaseAlgorithm, facts: PolicyFacts, folder: Path, *, with_torch: bool = False
+    model: BaseAlgorithm,
+    facts: PolicyFacts,
+    folder: Path,
+    *,
+    with_torch: bool = False,
+    learned: VecNormalize | None = None,
 ) -> PolicyCard:
     """Write a model as `policy.onnx` with its card, and return the card.
 
@@ -335,16 +372,18 @@ def export_sb3(
         facts: What the card says beyond the network.
         folder: Where to write; made if need be.
         with_torch: Also write the network as a torch program.
+        learned: The VecNormalize around its environment, which becomes part of the network; None:
+            there was none.
 
     Raises:
         UsageError: The model's spaces do not fit the facts, or it cannot be exported.
     """
-    check_spaces(model, facts.observation, facts.actions)
-    network = network_of(model)
+    check_spaces(model, facts.observation, facts.actions, normalised_keys(learned))
+    network = network_of(model, tuple(boxes(facts.observation)), learned)
     training = model.policy.training
     model.policy.set_training_mode(False)
     try:
-        _check_decisions(model, network, facts)
+        _check_decisions(model, network, facts, learned)
         return export_network(network, facts, folder, with_torch=with_torch)
     finally:
         model.policy.set_training_mode(training)
@@ -399,14 +438,17 @@ def algorithm_class(name: str) -> type[BaseAlgorithm]:
     raise UsageError(f"algorithm {name!r}: accepted: {', '.join(sorted(known))}")
 
 
-def _check_decisions(model: BaseAlgorithm, network: nn.Module, facts: PolicyFacts) -> None:
+def _check_decisions(
+    model: BaseAlgorithm, network: nn.Module, facts: PolicyFacts, learned: VecNormalize | None
+) -> None:
     """Raise UsageError unless the network decides as the model's own `predict` does."""
     rng, device = np.random.default_rng(2), model.device
     seen = random_inputs(facts.observation, CHECKED, rng)
     memory = random_memory(memory_of(network), CHECKED, rng)
     # sb3-contrib has the layers first, then the rows.
     state = tuple(array.swapaxes(0, 1) for array in memory.values()) or None
-    decided, _ = model.policy.predict(cast("Any", seen), state, deterministic=True)
+    shown: Any = seen if learned is None else learned.normalize_obs(seen)
+    decided, _ = model.policy.predict(shown, state, deterministic=True)
     with torch.no_grad():
         arrays = [*(seen[key] for key in boxes(facts.observation)), *memory.values()]
         found = network(*(torch.from_numpy(array).to(device) for array in arrays))

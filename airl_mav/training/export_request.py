@@ -32,7 +32,7 @@ FLOWN = ("hold_s", "goal_radius_m", "altitude_m", "hover_after_s")
 
 SEEN = (
     *("layout", "frames", "kind", "projection", "horizontal_fov_deg", "distortion", "range_m"),
-    *("goal_height", "cameras"),
+    *("in_flight", "goal_height", "cameras"),
 )
 """What a policy sees but for the image's size: fields of the request and of a card."""
 
@@ -45,6 +45,7 @@ DEFAULTS: dict[str, Any] = {
     "horizontal_fov_deg": 90.0,
     "distortion": UNDISTORTED,
     "range_m": 20.0,
+    "in_flight": (),
     "goal_height": False,
     "cameras": {},
     "actions": "arc-25",
@@ -84,6 +85,11 @@ class ExportRequest(BaseModel):
     )
     weights: Path | None = Field(
         default=None, description="state_dict of a module of your own, as torch.save wrote it"
+    )
+    vec_normalize: Path | None = Field(
+        default=None,
+        description="what the `save` of the VecNormalize around the training environment wrote, for"
+        " a .zip: its statistics become part of the network",
     )
     like: str | None = Field(
         default=None,
@@ -198,6 +204,8 @@ class ExportRequest(BaseModel):
             raise FieldError("algorithm", accepted="the class that wrote the .zip: DQN, PPO, ...")
         if self.weights is not None and not self.own_module:
             raise FieldError("weights", self.weights, "with a module of your own")
+        if self.vec_normalize is not None and self.own_module:
+            raise FieldError("vec_normalize", self.vec_normalize, "with a .zip")
         known: dict[str, Any] = {**DEFAULTS, **{k: v for k, v in _given(taken).items() if v}}
         environment = None if self.like is None else _environment(self.like)
         if environment is not None:
@@ -257,6 +265,7 @@ def _known_of(spec: EnvironmentSpec) -> dict[str, Any]:
         "horizontal_fov_deg": camera.horizontal_fov_deg,
         "distortion": camera.distortion,
         "range_m": camera.range_m,
+        "in_flight": spec.in_flight,
         "goal_height": spec.goal_height,
         "cameras": further_seen(spec, vehicle),
         "actions": spec.actions,

@@ -92,20 +92,15 @@ class RecurrentNetwork(nn.Module):
         return self.head(found), torch.stack(hiddens, dim=1), torch.stack(cells, dim=1)
 
 
-class RecurrentOfSeveral(RecurrentNetwork):
-    """The same of a network that sees by further cameras, whose images follow the goal."""
+class RecurrentOfAny(RecurrentNetwork):
+    """The same of a network that takes any arrays, in the order of their keys."""
 
     def __init__(
-        self,
-        features: nn.Module,
-        lstm: nn.LSTM,
-        head: nn.Module,
-        image: str,
-        further: Sequence[str],
+        self, features: nn.Module, lstm: nn.LSTM, head: nn.Module, keys: Sequence[str]
     ) -> None:
-        """Take the parts as `RecurrentNetwork`, and the keys of the further images."""
-        super().__init__(features, lstm, head, image)
-        self.keys = (image, VELOCITY, GOAL, *further)
+        """Take the parts as `RecurrentNetwork`, and the keys."""
+        super().__init__(features, lstm, head)
+        self.keys = tuple(keys)
 
     def forward(self, *arrays: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Return the outputs (n, k), and hidden and cell (n, layers, units) after the decision."""

@@ -85,7 +85,7 @@ class TrainRequest(BaseModel):
         try:
             check_fields(loaded.algorithm)
         except FieldError as error:  # It is the file's, not an option's.
-            raise UsageError(f"{self.config}: {error.line()}") from None
+            raise UsageError(f"{self.config}: {error.line(sign=' = ')}") from None
         # Not what a command adds to it.
         asked = TrainRequest.model_fields.keys() - {"config", "out", "name", "resume"}
         changes = self.model_dump(include=asked)

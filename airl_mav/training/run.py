@@ -10,14 +10,17 @@ from collections import deque
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from airl_mav.core.clock import WallClock, utc_now
 from airl_mav.core.constants import US_PER_S
+from airl_mav.core.errors import FieldError
 from airl_mav.core.files import replace_file
 from airl_mav.core.provenance import package_versions
 from airl_mav.envs.decisions import FIRST_TRAINING_SEED, LAST_TRAINING_SEED
@@ -29,6 +32,7 @@ from airl_mav.envs.sb3 import NavigationVecEnv, Watcher
 from airl_mav.envs.spec import EnvironmentSpec, Randomisation
 from airl_mav.envs.vector import NavigationVectorEnv
 from airl_mav.policy.card import PolicyCard, PolicyFacts, Training
+from airl_mav.policy.observation_spec import SHIPPED
 from airl_mav.rehearsal.lock import locked
 from airl_mav.training.algorithms import make_model
 from airl_mav.training.checkpoint import load_latest, save_checkpoint
@@ -49,7 +53,7 @@ RECENT = 200
 """Episodes in training that the shown success rate is of."""
 
 LOG_EVERY = 100
-"""Episodes (off-policy) between two points of the TensorBoard curves."""
+"""Episodes between two points of the TensorBoard curves; of learners with rollouts: each is one."""
 
 
 class TrainingResult(NamedTuple):
@@ -98,10 +102,12 @@ def train(
             process trains in it, or the network cannot be exported.
         KeyboardInterrupt: Ctrl-C; the newest checkpoint stays, and `resume` continues from it.
     """
-    check_fields(config.algorithm)  # before there is a folder
+    check_fields(config.algorithm)
     config = config.model_copy(update={"environment": bounded(config.environment)})
     progress = progress or TrainingProgress()
     with locked(out, progress.waiting):
+        if not TrainingFolder(out).begun:
+            check_trainable(config, name, device)  # before there is a run in the folder
         folder = TrainingFolder.begin(out, config, command, resume=resume)
         if view is None:
             best = fit(config, folder, progress, device)
@@ -112,6 +118,36 @@ def train(
             with closing(WatchedTraining(view, config.environment, progress)) as watched:
                 best = fit(config, folder, watched, device, watched)
         return TrainingResult(folder, best, export_best(folder, config, name))
+
+
+def check_trainable(config: TrainingConfig, name: str, device: str = "cpu") -> None:
+    """Raise UsageError where a training could not begin, or its network could not be exported.
+
+    What is the user's own is exported once, as nobody has tried it before; that takes seconds.
+    """
+    env = environment_of(config)
+    check_actions(config.algorithm.name, kind_of(config.environment.actions))
+    model = learner_of(config, env, device)
+    if config.initial is not None:
+        begin_with(model, Path(config.initial), None)
+    if config.network.own or config.environment.layout not in SHIPPED:
+        with TemporaryDirectory() as scratch:
+            export_sb3(model, facts_of(config, name, "", 0), Path(scratch))
+
+
+def environment_of(config: TrainingConfig, watcher: Watcher | None = None) -> NavigationVecEnv:
+    """Make the environment of a training. Raises UsageError, and FieldError by the file's names."""
+    try:
+        made = NavigationVectorEnv(config.vehicles, config.environment)
+    except FieldError as error:
+        field = f"environment.{error.field}"
+        raise FieldError(field, error.value, error.accepted, error.problem) from None
+    return NavigationVecEnv(made, watcher)
+
+
+def learner_of(config: TrainingConfig, env: NavigationVecEnv, device: str) -> BaseAlgorithm:
+    """Make the learner of a training, with fresh weights. Raises UsageError."""
+    return make_model(config.algorithm, config.network, env, config.seed, device=device)
 
 
 def fit(
@@ -131,9 +167,9 @@ def fit(
             no such weights to begin with.
     """
     check_actions(config.algorithm.name, kind_of(config.environment.actions))
-    env = NavigationVecEnv(NavigationVectorEnv(config.vehicles, config.environment), watcher)
+    env = environment_of(config, watcher)
     env.seed(config.seed)
-    model = make_model(config.algorithm, config.network, env, config.seed, device=device)
+    model = learner_of(config, env, device)
     model.set_logger(configure(str(folder.tensorboard), ["tensorboard"]))
     callback = _BetweenRollouts(config, folder, progress, env)
     meta = load_latest(folder.checkpoints, model)
@@ -146,9 +182,9 @@ def fit(
         begin_with(model, Path(config.initial), log_std)
     left = config.steps - model.num_timesteps
     if left > 0 and not callback.done:
-        model.learn(
-            left, callback=callback, log_interval=LOG_EVERY, reset_num_timesteps=meta is None
-        )
+        # To stable-baselines3 it is a number of episodes, or of rollouts.
+        every = 1 if isinstance(model, OnPolicyAlgorithm) else LOG_EVERY
+        model.learn(left, callback=callback, log_interval=every, reset_num_timesteps=meta is None)
     callback.finish(model)
     best = folder.best()
     assert best is not None  # noqa: S101 - finish() has evaluated
@@ -318,8 +354,17 @@ def export_best(folder: TrainingFolder, config: TrainingConfig, name: str) -> Po
     """Export the best weights of a run to its `policy` folder. Raises UsageError if it cannot."""
     best, about = folder.best(), folder.about()
     assert best is not None  # noqa: S101 - a finished run has one
+    facts = facts_of(config, name, about["command"], best.steps)
+    # As many as learned: with fewer a rollout would not fill its batches.
+    model = learner_of(config, environment_of(config), "cpu")
+    model.set_parameters(str(folder.best_model), device="cpu")
+    return export_sb3(model, facts, folder.policy)
+
+
+def facts_of(config: TrainingConfig, name: str, command: str, steps: int) -> PolicyFacts:
+    """Return what the card of a training's policy says, after so many decisions."""
     environment = config.environment
-    facts = PolicyFacts(
+    return PolicyFacts(
         name=name,
         description=config.description,
         observation=Navigation(environment, 1).observation,
@@ -336,16 +381,11 @@ def export_best(folder: TrainingFolder, config: TrainingConfig, name: str) -> Po
             first_arena_seed=FIRST_TRAINING_SEED,
             last_arena_seed=LAST_TRAINING_SEED - 1,
             seed=config.seed,
-            env_steps=best.steps,
+            env_steps=steps,
             config_file=name,
             config=config.model_dump(mode="json", exclude_none=True),
-            command=about["command"],
+            command=command,
             versions=package_versions(),
             date_utc=utc_now().isoformat(timespec="seconds"),
         ),
     )
-    # As many as learned: with fewer a rollout would not fill its batches.
-    env = NavigationVecEnv(NavigationVectorEnv(config.vehicles, environment))
-    model = make_model(config.algorithm, config.network, env, config.seed)
-    model.set_parameters(str(folder.best_model), device="cpu")
-    return export_sb3(model, facts, folder.policy)

@@ -109,7 +109,7 @@ class TrainingFolder:
             UsageError: It holds a run that is not to be resumed, or has another configuration.
         """
         folder = cls(path)
-        if not (path / CONFIG_FILE).exists():
+        if not folder.begun:
             plain = config.model_dump(mode="json", exclude_none=True)
             about = {"schema": SCHEMA, **provenance(command), "config": plain}
             write_json(path / CONFIG_FILE, about)
@@ -129,6 +129,11 @@ class TrainingFolder:
                 f"({', '.join(changed)}); accepted: the same"
             )
         return folder
+
+    @property
+    def begun(self) -> bool:
+        """Whether there is a run in it."""
+        return (self.path / CONFIG_FILE).exists()
 
     def about(self) -> dict[str, Any]:
         """Return what `train.json` holds. Raises UsageError when there is no run."""

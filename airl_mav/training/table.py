@@ -21,6 +21,8 @@ EARLIER_NAMES = {"qrdqn": "qr-dqn"}
 """Names that training files of earlier versions have."""
 
 _GRADIENT_NORM = "greatest norm of a gradient; greater ones are scaled down"
+_LAMBDA = "lambda of the generalised advantage estimate"
+_ADVANTAGE = "scale the advantages of a batch to mean 0, deviation 1"
 
 
 class Options(ProfileModel):
@@ -31,8 +33,8 @@ class Options(ProfileModel):
     )
 
 
-class TargetOptions(Options):
-    """Options of the algorithms with a target network."""
+class TargetNumbers(ProfileModel):
+    """What a target network has."""
 
     tau: float | None = quantity(
         "share of the online network in an update of the target network",
@@ -43,20 +45,46 @@ class TargetOptions(Options):
     )
 
 
+class TargetOptions(Options, TargetNumbers):
+    """Options of the algorithms with a target network."""
+
+
 class DqnOptions(TargetOptions):
     """Options of `dqn`."""
 
     max_grad_norm: float | None = quantity(_GRADIENT_NORM, "1", gt=0, le=1e6, default=None)
 
 
-class ReplayOptions(TargetOptions):
-    """Options of the algorithms with a replay memory of stable-baselines3."""
+class DdpgOptions(TargetNumbers):
+    """Options of `ddpg` (Lillicrap et al., arXiv 1509.02971), and of all with SB3's replay."""
 
     train_freq: int | None = quantity(
         "steps of each vehicle between two rounds of updates", "1", ge=1, le=10**6, default=None
     )
     gradient_steps: int | None = quantity(
         "updates a round; -1: as many as steps were flown", "1", ge=-1, le=10**6, default=None
+    )
+
+
+class ReplayOptions(TargetOptions, DdpgOptions):
+    """Options of the algorithms with a replay memory of stable-baselines3."""
+
+
+class Td3Options(ReplayOptions):
+    """Options of `td3` (Fujimoto et al., arXiv 1802.09477)."""
+
+    policy_delay: int | None = quantity(
+        "updates of the critics for one of the actor", "1", ge=1, le=1000, default=None
+    )
+    target_policy_noise: float | None = quantity(
+        "standard deviation of the noise on the target's actions",
+        "1",
+        ge=0,
+        le=10,
+        default=None,
+    )
+    target_noise_clip: float | None = quantity(
+        "greatest such noise", "1", ge=0, le=10, default=None
     )
 
 
@@ -88,6 +116,62 @@ class NoiseOptions(ProfileModel):
         "1",
         ge=-1,
         le=10**6,
+        default=None,
+    )
+
+
+class A2cOptions(Options, NoiseOptions):
+    """Options of `a2c` (Mnih et al., arXiv 1602.01783)."""
+
+    n_steps: int | None = quantity(
+        "steps of each vehicle a rollout; left out: 5", "1", ge=1, le=10**6, default=None
+    )
+    gae_lambda: float | None = quantity(_LAMBDA, "1", ge=0, le=1, default=None)
+    ent_coef: float | None = quantity("weight of the entropy", "1", ge=0, le=10, default=None)
+    vf_coef: float | None = quantity("weight of the value's loss", "1", ge=0, le=100, default=None)
+    max_grad_norm: float | None = quantity(_GRADIENT_NORM, "1", gt=0, le=1e6, default=None)
+    rms_prop_eps: float | None = quantity(
+        "added to RMSprop's denominator", "1", gt=0, le=1, default=None
+    )
+    use_rms_prop: bool | None = Field(default=None, description="RMSprop, or else Adam")
+    normalize_advantage: bool | None = Field(default=None, description=_ADVANTAGE)
+
+
+class TrpoOptions(Options, NoiseOptions):
+    """Options of `trpo` (Schulman et al., arXiv 1502.05477)."""
+
+    n_steps: int | None = quantity(
+        "steps of each vehicle a rollout; left out: 4096 of all together, in whole batches",
+        "1",
+        ge=1,
+        le=10**6,
+        default=None,
+    )
+    gae_lambda: float | None = quantity(_LAMBDA, "1", ge=0, le=1, default=None)
+    cg_max_steps: int | None = quantity(
+        "most steps of the conjugate gradient", "1", ge=1, le=1000, default=None
+    )
+    cg_damping: float | None = quantity(
+        "damping of the Hessian's products", "1", ge=0, le=10, default=None
+    )
+    line_search_shrinking_factor: float | None = quantity(
+        "by which a step shrinks in the line search", "1", gt=0, lt=1, default=None
+    )
+    line_search_max_iter: int | None = quantity(
+        "most steps of the line search", "1", ge=1, le=1000, default=None
+    )
+    n_critic_updates: int | None = quantity(
+        "updates of the value a rollout", "1", ge=1, le=1000, default=None
+    )
+    normalize_advantage: bool | None = Field(default=None, description=_ADVANTAGE)
+    target_kl: float | None = quantity(
+        "KL divergence that a step may reach", "1", gt=0, le=100, default=None
+    )
+    sub_sampling_factor: int | None = quantity(
+        "so many-th of a rollout are the samples of the step's direction",
+        "1",
+        ge=1,
+        le=1000,
         default=None,
     )
 
@@ -135,18 +219,14 @@ class PpoOptions(Options, NoiseOptions):
     n_epochs: int | None = quantity(
         "passes over a rollout; left out: 4", "1", ge=1, le=1000, default=None
     )
-    gae_lambda: float | None = quantity(
-        "lambda of the generalised advantage estimate", "1", ge=0, le=1, default=None
-    )
+    gae_lambda: float | None = quantity(_LAMBDA, "1", ge=0, le=1, default=None)
     clip_range: float | None = quantity(
         "greatest change of an action's odds in a rollout", "1", gt=0, le=1, default=None
     )
     clip_range_vf: float | None = quantity(
         "greatest change of a value in a rollout; left out: any", "1", gt=0, le=1e6, default=None
     )
-    normalize_advantage: bool | None = Field(
-        default=None, description="scale the advantages of a batch to mean 0, deviation 1"
-    )
+    normalize_advantage: bool | None = Field(default=None, description=_ADVANTAGE)
     ent_coef: float | None = quantity(
         "weight of the entropy; left out: 0.005", "1", ge=0, le=10, default=None
     )
@@ -218,8 +298,8 @@ class Algorithm:
     """Fields of `[algorithm]` that it has, and the names of its arguments for them."""
     actions: ActionKind | None = None
     """The only kind of action set that it can choose from; None: both."""
-    options: type[ProfileModel] | None = None
-    """Its hyperparameters; None: any argument of the class."""
+    options: type[ProfileModel] = Options
+    """Its hyperparameters."""
     to_policy: tuple[str, ...] = ()
     """Options that the network takes, not the learner."""
     defaults: Mapping[str, Any] = field(default_factory=dict)
@@ -303,10 +383,10 @@ ALGORITHMS: dict[str, Algorithm] = {
         batch=256,
     ),
     "dagger": Algorithm(_IMITATION, _IMITATED, options=DaggerOptions, batch=256),
-    "a2c": Algorithm("stable_baselines3.A2C", _ANY),
-    "ddpg": Algorithm("stable_baselines3.DDPG", _REPLAY, "continuous"),
-    "td3": Algorithm("stable_baselines3.TD3", _REPLAY, "continuous"),
-    "trpo": Algorithm("sb3_contrib.TRPO", _BATCHES, batch=256, rollouts=True),
+    "a2c": Algorithm("stable_baselines3.A2C", _ANY, options=A2cOptions),
+    "ddpg": Algorithm("stable_baselines3.DDPG", _REPLAY, "continuous", DdpgOptions),
+    "td3": Algorithm("stable_baselines3.TD3", _REPLAY, "continuous", Td3Options),
+    "trpo": Algorithm("sb3_contrib.TRPO", _BATCHES, options=TrpoOptions, batch=256, rollouts=True),
 }
 """Algorithms that take Dict observations and need no action mask."""
 

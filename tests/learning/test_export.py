@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+import pickle
 import re
 import sys
 import warnings
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ pytest.importorskip("onnxscript", reason="needs the [train] extra")
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from stable_baselines3.dqn.policies import MultiInputPolicy
 from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
@@ -35,7 +37,8 @@ from airl_mav.policy.observation_spec import ObservationSpec
 from airl_mav.profiles.computer import load_computer
 from airl_mav.training import onnx_export as export
 from airl_mav.training.export import export_sb3, network_of
-from tests.support.policy_kit import SPEC, export_tiny, facts, make_model, noise
+from airl_mav.training.onnx_export import random_inputs
+from tests.support.policy_kit import SPEC, Nowhere, export_tiny, facts, make_model, noise
 from tests.support.processes import ROOT
 
 ONE = (
@@ -324,6 +327,45 @@ def test_a_recurrent_policy_remembers_as_the_model_does(name: str, tmp_path: Pat
     assert differs > 5, "the memory matters"
 
 
+OWN_LAYOUT = """
+from airl_mav.policy.layouts import boxes, encode_layout
+
+class Metric:
+    def boxes(self, spec):
+        return boxes(spec.model_copy(update={"layout": "body"}))
+
+    def encode(self, spec, seen):
+        body = encode_layout(spec.model_copy(update={"layout": "body"}), seen)
+        return {**body, "velocity": 5.0 * body["velocity"]}
+"""
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "changed"),
+    [("PPO", "layout"), ("RecurrentPPO", "in_flight"), ("RecurrentPPO", "both")],
+)
+def test_any_arrays_go_to_the_network_in_the_layout_s_order(
+    algorithm: str, changed: str, tmp_path: Path
+) -> None:
+    """A layout of one's own has them sorted, even where they are those of `body`."""
+    (tmp_path / "layouts.py").write_text(OWN_LAYOUT)
+    changes: dict[str, Any] = {}
+    if changed != "layout":
+        changes["in_flight"] = ("command", "age")
+    if changed != "in_flight":
+        changes["layout"] = f"{tmp_path / 'layouts.py'}:Metric"
+    spec = ObservationSpec.model_validate(SPEC.model_dump() | changes)
+    options: dict[str, Any] = {"n_steps": 8} if algorithm == "RecurrentPPO" else {}
+    model = make_model(algorithm, "velocity", spec=spec, **options)
+    asked = facts(observation=spec, actions=ActionSpec(set="velocity"))
+    card = export_sb3(model, asked, tmp_path / "mine")
+    seen = random_inputs(spec, 20, np.random.default_rng(1))
+    wanted, _ = model.predict(seen, deterministic=True)
+    found = load_learned(tmp_path / "mine", trust=True).act_batch(seen)
+    compare(found, wanted)
+    assert card.observation == spec
+
+
 def test_the_card_and_the_file_agree_on_the_memory(tmp_path: Path) -> None:
     model = make_model("RecurrentPPO", n_steps=8, policy_kwargs={"lstm_hidden_size": 12})
     card = export_sb3(model, facts(), tmp_path)
@@ -432,6 +474,103 @@ def test_a_foreign_continuous_model_and_the_paper_layout(
     assert load_card(tmp_path / "p").observation == paper
 
 
+def normalised(keys: Sequence[str], **options: Any) -> VecNormalize:
+    """A VecNormalize that has seen something."""
+    space: spaces.Space[Any] = spaces.Discrete(25)
+    env = VecNormalize(
+        DummyVecEnv([lambda: Nowhere(SPEC, space)]), norm_obs_keys=list(keys), **options
+    )
+    rng = np.random.default_rng(3)
+    for key in keys if env.norm_obs else ():
+        env.obs_rms[key].update(rng.normal(1.0, 0.5, (50, 3)))
+    return env
+
+
+@pytest.mark.parametrize("algorithm", ["DQN", "RecurrentPPO"])
+def test_what_a_vec_normalize_did_becomes_part_of_the_network(
+    algorithm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    env = normalised(["velocity", "goal"], clip_obs=2.5)
+    env.save(str(tmp_path / "vecnormalize.pkl"))
+    options: dict[str, Any] = {"n_steps": 8} if algorithm == "RecurrentPPO" else {}
+    model = make_model(algorithm, **options)
+    model.save(tmp_path / "model.zip")
+    words = ("export", tmp_path / "model.zip", "--algorithm", algorithm, "--out", tmp_path / "p")
+    given = ("--vec-normalize", tmp_path / "vecnormalize.pkl")
+    assert airl(monkeypatch, *words, *given) == 0
+    seen = noise(100)
+    shown: Any = env.normalize_obs(dict(seen))
+    assert (np.abs(shown["velocity"]) == 2.5).any(), "some are cut off"
+    wanted, _ = model.predict(shown, deterministic=True)
+    without, _ = model.predict(seen, deterministic=True)
+    assert (wanted != without).any()
+    compare(load_learned(tmp_path / "p").act_batch(seen), wanted)
+
+
+def test_a_vec_normalize_of_rewards_alone_changes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    normalised([], norm_obs=False).save(str(tmp_path / "vecnormalize.pkl"))
+    make_model("DQN").save(tmp_path / "model.zip")
+    words = ("export", tmp_path / "model.zip", "--algorithm", "DQN", "--out")
+    given = ("--vec-normalize", tmp_path / "vecnormalize.pkl")
+    assert airl(monkeypatch, *words, tmp_path / "with", *given) == 0
+    assert airl(monkeypatch, *words, tmp_path / "without") == 0
+    assert read_card(tmp_path / "with").sha256 == read_card(tmp_path / "without").sha256
+
+
+@pytest.mark.parametrize(
+    ("model", "file", "line"),
+    [
+        ("model.zip", "absent.pkl", "--vec-normalize absent.pkl: no such file"),
+        ("model.zip", "model.zip", "--vec-normalize model.zip: no VecNormalize: "),
+        ("model.zip", "other.pkl", "--vec-normalize other.pkl: accepted: what a VecNormalize of"),
+        ("nets.py:Net", "other.pkl", "--vec-normalize other.pkl: accepted: with a .zip"),
+        ("static-obstacles", "other.pkl", "--vec-normalize other.pkl: accepted: of a policy that"),
+    ],
+)
+def test_what_is_no_vec_normalize_is_refused_in_one_line(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    model: str,
+    file: str,
+    line: str,
+) -> None:
+    make_model("DQN").save(tmp_path / "model.zip")
+    (tmp_path / "nets.py").write_text(NETS)
+    (tmp_path / "other.pkl").write_bytes(pickle.dumps([1, 2]))
+    monkeypatch.chdir(tmp_path)
+    words = ("--algorithm", "DQN") if model == "model.zip" else ()
+    assert airl(monkeypatch, "export", model, "--vec-normalize", file, "--out", "p", *words) == 2
+    (told,) = capsys.readouterr().err.splitlines()
+    assert line in told
+    assert not (tmp_path / "p").exists()
+
+
+TOLD = """
+description = "told of its own decisions"
+
+[environment]
+arena = "no-obstacles"
+in_flight = ["command", "latency"]
+"""
+
+
+def test_what_a_network_is_told_is_told_by_a_configuration(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told = ObservationSpec.model_validate(SPEC.model_dump() | {"in_flight": ("command", "latency")})
+    make_model("PPO", spec=told).save(tmp_path / "model.zip")
+    (tmp_path / "told.toml").write_text(TOLD)
+    words = ("export", tmp_path / "model.zip", "--algorithm", "PPO", "--out", tmp_path / "p")
+    assert airl(monkeypatch, *words) == 2
+    line = capsys.readouterr().err
+    assert "What in_flight tells is told by --like CONFIGURATION" in line
+    assert airl(monkeypatch, *words, "--like", tmp_path / "told.toml") == 0
+    assert load_card(tmp_path / "p").observation == told
+
+
 def test_a_zip_says_its_image_and_kind_of_actions_itself(
     zips: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -478,31 +617,39 @@ class Narrow(Net):
 
 
 @pytest.mark.parametrize("name", ["make_net", "OfADict"])
+@pytest.mark.parametrize("layout", ["body", "own"])
 def test_a_module_of_one_s_own_flies_as_it_decides(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, layout: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """By the names of its arguments: a layout of one's own has goal and velocity the other way."""
     (tmp_path / "nets.py").write_text(NETS)
+    (tmp_path / "layouts.py").write_text(OWN_LAYOUT)
+    spec = SPEC
+    if layout == "own":
+        layout = f"{tmp_path / 'layouts.py'}:Metric"
+        spec = ObservationSpec.model_validate(SPEC.model_dump() | {"layout": layout})
     torch.manual_seed(3)
     trained = nn.Linear(6, 2)
     weights = {f"dense.{key}": value for key, value in trained.state_dict().items()}
     torch.save(weights, tmp_path / "net.pt")
     words = ("--weights", tmp_path / "net.pt", "--like", "dynamic-obstacles", "--hold-s", "0.3")
     source, out = f"{tmp_path / 'nets.py'}:{name}", tmp_path / "mine"
-    assert airl(monkeypatch, "export", source, "--out", out, *words) == 0
-    card = load_card(out)
+    assert airl(monkeypatch, "export", source, "--layout", layout, "--out", out, *words) == 0
+    card = load_card(out, trust=True)
     # Of the configuration, but for what was said.
     assert (card.actions.set, card.hold_s, card.training.arena) == (
         "velocity",
         0.3,
         "dynamic-obstacles",
     )
-    assert card.observation == SPEC
+    assert card.observation == spec
     seen = noise(20)
     both = np.concatenate([seen["velocity"], seen["goal"]], axis=1)
     with torch.no_grad():
         wanted = torch.tanh(trained(torch.from_numpy(both))).numpy()
     wanted *= seen["depth"].reshape(20, -1).min(axis=1, keepdims=True) / np.float32(255.0)
-    np.testing.assert_allclose(open_model(out, card).infer(seen), wanted, atol=1e-5)
+    runtime = open_model(out, card, trust=True)
+    np.testing.assert_allclose(runtime.infer(seen), wanted, atol=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -220,9 +220,64 @@ def test_wrong_arguments_of_the_vector_environment() -> None:
     env = NavigationVectorEnv(2)
     with pytest.raises(UsageError, match="seed: 3 numbers; accepted: 2"):
         env.reset(seed=[1, 2, 3])
-    with pytest.raises(ValueError, match=r"shape \(1, 3\): accepted: \(2, 3\)"):
-        env.reset(seed=1)
-        env.step(np.array([3]))
+    for seed, line in (
+        (5.0, r"seed = 5\.0: accepted: a whole number, or one for each"),
+        ("5", "seed = '5': accepted: a whole number, or one for each"),
+        ([-1, 2], "seed = -1: accepted: a whole number, 0 to"),
+        ([1.0, 2], r"seed = 1\.0: accepted: a whole number, 0 to"),
+        ([1, 2**63], "seed = 9223372036854775808: accepted: a whole number, 0 to"),
+    ):
+        wrong: Any = seed
+        with pytest.raises(UsageError, match=line):
+            env.reset(seed=wrong)
+    with pytest.raises(UsageError, match="seed = 9223372036854775808: accepted"):
+        NavigationEnv().reset(seed=2**63)
+
+
+@pytest.mark.parametrize(
+    ("knobs", "action", "line"),
+    [
+        ({}, -1, "action -1: accepted: 0 <= value <= 24"),
+        ({}, 25, "action 25: accepted: 0 <= value <= 24"),
+        ({}, 3.0, "type float64: accepted: whole numbers"),
+        ({}, True, "type bool: accepted: whole numbers"),
+        ({}, None, "type object: accepted: whole numbers"),
+        ({}, [3], r"shape \(1,\): accepted: \(\)"),
+        ({"actions": "velocity"}, [np.nan, 0.0], "action nan: accepted: numbers, -1 to 1"),
+        ({"actions": "velocity"}, [0.5, 0.0, 0.5], r"shape \(3,\): accepted: \(2,\)"),
+        ({"actions": "velocity"}, 0.5, r"shape \(\): accepted: \(2,\)"),
+        ({"actions": "velocity"}, ["a", "b"], "type <U1: accepted: numbers"),
+        ({"actions": "velocity3d"}, [0.5, 0.0], r"shape \(2,\): accepted: \(3,\)"),
+        ({"actions": "velocity3d"}, [0.5, 0.0, np.nan], "action nan: accepted: numbers"),
+    ],
+)
+def test_what_is_no_action_of_the_set_is_not_flown(
+    knobs: dict[str, Any], action: Any, line: str
+) -> None:
+    """Nothing moves, and the episode goes on with a valid one."""
+    env, many = NavigationEnv(**knobs), NavigationVectorEnv(2, **knobs)
+    env.reset(seed=1)
+    many.reset(seed=[1, 2])
+    valid: Any = env.action_space.sample()
+    with pytest.raises(gym.error.InvalidAction, match=line) as caught:
+        env.step(action)
+    assert "\n" not in str(caught.value)
+    if np.shape(action) == np.shape(valid):
+        with pytest.raises(gym.error.InvalidAction, match=line):
+            many.step(np.array([valid, action], np.asarray(action).dtype))
+    with pytest.raises(gym.error.InvalidAction, match=r"accepted: \(2,"):
+        many.step(np.array([valid] * 3))
+    assert env.navigation.fleet.time_us[0] == 0
+    assert not many.navigation.fleet.time_us.any()
+    env.step(valid)
+
+
+def test_numbers_beyond_the_stick_are_cut_off() -> None:
+    env, within = NavigationEnv(actions="velocity"), NavigationEnv(actions="velocity")
+    for each, action in ((env, [np.inf, -7.0]), (within, [1.0, -1.0])):
+        each.reset(seed=1)
+        each.step(action)
+    assert np.array_equal(env.navigation.fleet.setpoint, within.navigation.fleet.setpoint)
 
 
 def test_the_seed_of_reset_is_that_of_the_episode() -> None:

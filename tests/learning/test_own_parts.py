@@ -55,6 +55,14 @@ class Bearing(BaseFeaturesExtractor):
     def forward(self, seen):
         blur = self.blur(seen["depth"]).flatten(1)
         return self.dense(torch.cat([blur, seen["goal"]], dim=1))
+
+
+class Undecided(Bearing):
+    """Asks Python what to do with what it sees, which no graph can."""
+
+    def forward(self, seen):
+        found = super().forward(seen)
+        return found if float(found.sum()) > 0.0 else 2.0 * found
 '''
 
 
@@ -118,6 +126,19 @@ def test_a_network_of_the_user_s_trains_and_flies(parts: str, tmp_path: Path) ->
     assert card.network == "dense 16, dense 24, dense 25"
     assert card.parameters == 5 * 16 + 17 * 24 + 25 * 25
     assert card.training.config["environment"]["reward"] == f"{parts}:Costly"
+
+
+def test_a_network_that_cannot_be_exported_is_refused_before_it_learns(
+    parts: str, tmp_path: Path
+) -> None:
+    data = {
+        "description": "of one's own",
+        "environment": {"arena": "no-obstacles"},
+        "network": {"kind": f"{parts}:Undecided", "options": {"width": 16}},
+    }
+    with pytest.raises(UsageError, match="cannot export the network"):
+        train(validated(TrainingConfig, data), tmp_path / "run", name="mine")
+    assert not list((tmp_path / "run").iterdir())
 
 
 def test_what_is_no_extractor_is_refused(parts: str, tmp_path: Path) -> None:

@@ -206,6 +206,20 @@ def test_folders_are_not_mixed_up(short: Path, straight: Path, tmp_path: Path) -
         ("[algorithm]\nname = 'sac'\n", ["sac", "discrete"]),
         ("[network]\nkind = 'template'\n", ["layers"]),
         ("steps = -1\n", ["steps", "value"]),
+        ("initial = 'nowhere'\n", ["nowhere", "no training run here"]),
+        (
+            "[environment]\nreward = 'nope.py:r'\n",
+            ["bad.toml: environment.reward = 'nope.py:r': nope.py: no such file"],
+        ),
+        (
+            "[environment]\nactions = 'os:getcwd'\n",
+            ["bad.toml: environment.actions = 'os:getcwd': accepted: a class with"],
+        ),
+        ("[environment.cameras.nose]\n", ["bad.toml: environment.cameras.nose: vehicle quad"]),
+        (
+            "[algorithm]\nname = 'a2c'\noptions = {n_steps = 'many'}\n",
+            ["bad.toml: algorithm.options.n_steps = 'many': accepted: 1 <= value"],
+        ),
     ],
 )
 def test_a_wrong_configuration_gets_one_line(text: str, names: list[str], tmp_path: Path) -> None:
@@ -218,6 +232,27 @@ def test_a_wrong_configuration_gets_one_line(text: str, names: list[str], tmp_pa
     assert "\n" not in told
     for name in names:
         assert name in told
+    assert not (tmp_path / "run/train.json").exists(), "the folder is free for a corrected file"
+
+
+def test_the_curves_of_a_learner_with_rollouts_have_a_point_for_each(tmp_path: Path) -> None:
+    """Of the return too: stable-baselines3 counts rollouts where others count episodes."""
+    events = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    config = TrainingConfig.model_validate(
+        {
+            "description": "curves",
+            "steps": 1000,
+            "vehicles": 8,
+            "environment": {"arena": "no-obstacles", "episode": {"time_limit_s": 4.0}},
+            "algorithm": {"name": "ppo", "batch_size": 64, "options": {"n_steps": 32}},
+            "selection": {"every": 10_000, "episodes": 2},
+        }
+    )
+    done = run.train(config, tmp_path / "run", name="curves")
+    found = events.EventAccumulator(str(done.folder.tensorboard))
+    found.Reload()
+    for name in ("rollout/ep_rew_mean", "rollout/ep_len_mean", "rollout/success_rate"):
+        assert [point.step for point in found.Scalars(name)] == [256, 512, 768, 1024]
 
 
 def test_a_folder_without_a_run_is_said_to_be_none(tmp_path: Path) -> None:

@@ -166,7 +166,7 @@ def test_a_card_names_no_code(package: Path) -> None:
         ({"kind": "large"}, "network.kind 'large': accepted: 'small', 'appendix', 'template', FI"),
         ({"dense": [64]}, "dense: kind 'small' has no such field"),
         ({"kind": "pkg:Mine", "strides": [1, 1, 1, 1]}, "strides: kind 'pkg:Mine' has no such"),
-        ({"kind": "pkg:Mine", "layers": 2}, "layers: kind 'pkg:Mine' has no it"),
+        ({"kind": "pkg:Mine", "layers": 2}, "layers: kind 'pkg:Mine' has no such field"),
         ({"kind": "pkg:Mine", "dense": [0]}, r"network.dense.* 0: accepted"),
     ],
 )
