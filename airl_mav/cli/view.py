@@ -18,21 +18,25 @@ from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.ports import LOOPBACK
 from airl_mav.rehearsal.run_folder import load
 from airl_mav.report.arenas import trust_arenas
-from airl_mav.report.replay.runs import ReplayedRun
+from airl_mav.report.replay.runs import ReplayedRuns, run_folders
 from airl_mav.scenario.aircraft import GREATEST_PORT
 
 
 class ViewOptions(ProfileModel):
     """Replay the flights of a run in a browser, the worst first; Ctrl-C ends it.
 
+    Of a campaign (airl evaluate of several policies, gap, degrade, ...) any two runs can be chosen
+    on the page; it begins with the first.
+
     Examples:
         airl view runs/20261122T101530Z-sitl-static-obstacles
         airl view runs/A 7 --beside runs/B
+        airl view runs/20261122T114501Z-gap
         airl view flights/20261123T101530.123456Z.mcap
     """
 
     run: Annotated[Path, POSITIONAL] = Field(
-        description="run folder, or the black box of a flight (.mcap)"
+        description="run folder, campaign, or the black box of a flight (.mcap)"
     )
     flight: Annotated[int | None, POSITIONAL] = Field(
         default=None, description="number of the flight that is shown first; by default the worst"
@@ -65,14 +69,16 @@ def run(options: ViewOptions, console: Console | None = None) -> int:
     """
     console = console or new_console()
     paths = [options.run] if options.beside is None else [options.run, options.beside]
-    folders = [folder_of(path) for path in paths]
+    found = [run_folders(folder_of(path)) for path in paths]
+    folders = [folder for each in found for folder in each]
     if options.trust:
         for folder in folders:
             trust_arenas(load(folder))
-    runs = [ReplayedRun(folder) for folder in folders]
-    replayed, *others = runs
+    runs = ReplayedRuns(folders)
+    shown = [runs.at(each[0]) for each in found]
+    replayed, *others = shown
     first = replayed.records[0] if options.flight is None else replayed.record(options.flight)
-    for each in runs:
+    for each in shown:
         if (same := each.same(first)) is not None:
             each.check(same)
     # Imported here: what draws is an extra.
@@ -91,7 +97,7 @@ def run(options: ViewOptions, console: Console | None = None) -> int:
         # longer to import than all above.
         from airl_mav.report.replay.page import ReplayPage
 
-        ReplayPage(server, replayed, others[0] if others else None, first).run()
+        ReplayPage(server, replayed, others[0] if others else None, first, runs).run()
     except KeyboardInterrupt:
         return 0
     finally:

@@ -64,6 +64,10 @@ class Panel:
         self._decisions = 0
         self._is_blank = True
 
+    def name(self, run: str) -> None:
+        """Call the run something else from now on."""
+        self._run = run
+
     def draw_title(self, shown: Shown) -> None:
         """Show what flies."""
         if self._title.content != (title := title_html(shown, self._run)):

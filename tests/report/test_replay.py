@@ -13,8 +13,9 @@ import pytest
 
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.flight.judge import Outcome
+from airl_mav.rehearsal.run_folder import CAMPAIGN_FILE
 from airl_mav.report.replay.flight import ReplayedFlight, parting_s
-from airl_mav.report.replay.runs import ReplayedRun
+from airl_mav.report.replay.runs import ReplayedRun, ReplayedRuns, run_folders
 from airl_mav.view.shown import Shown
 from tests.support.processes import PATIENCE_S, running
 from tests.support.run_demo import write_demo_run
@@ -209,3 +210,77 @@ def test_the_page_plays_steps_and_shows_the_other_run(watched: Watched) -> None:
     assert page._shown.flight is not None
     assert page._shown.flight.index == last.index
     assert page._pick.value.startswith(f"{last.index:03d}")
+
+
+# --- campaigns
+
+
+@pytest.fixture(scope="module")
+def campaign(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three cells: two that have flown, one that is damaged."""
+    path = tmp_path_factory.mktemp("campaign") / "gap"
+    for name, episodes in (("late", 3), ("early", 2)):
+        write_demo_run(path / name, episodes=episodes, profile="static-obstacles")
+    (path / "gone").mkdir()
+    (path / "gone" / "run.json").write_text("{}", encoding="utf-8")
+    (path / CAMPAIGN_FILE).write_text("{}", encoding="utf-8")
+    return path
+
+
+def test_a_campaign_stands_for_its_runs(campaign: Path, folder: Path, tmp_path: Path) -> None:
+    assert [each.name for each in run_folders(campaign)] == ["early", "gone", "late"]
+    assert run_folders(folder) == [folder]
+    (tmp_path / CAMPAIGN_FILE).write_text("{}", encoding="utf-8")
+    with pytest.raises(UsageError, match="no run has begun"):
+        run_folders(tmp_path)
+
+
+def test_runs_are_named_by_their_folders_or_paths(campaign: Path, folder: Path) -> None:
+    runs = ReplayedRuns([campaign / "late", folder, folder])
+    assert runs.names == ("late", folder.name)
+    assert runs.run("late") is runs.at(campaign / "late")
+    assert runs.name_of(runs.run("late")) == "late"
+    twins = [campaign / "late", campaign.parent / "other" / "late"]
+    assert ReplayedRuns(twins).names == tuple(map(str, twins))
+
+
+def test_any_two_runs_of_a_campaign_can_be_chosen(campaign: Path) -> None:
+    viser = pytest.importorskip("viser")
+    from airl_mav.report.replay.page import ALONE, ReplayPage
+
+    server, told = viser.ViserServer("127.0.0.1", 0, verbose=False), list[str]()
+    try:
+        runs = ReplayedRuns(run_folders(campaign))
+        page = ReplayPage(server, runs.run("early"), runs=runs)
+        elements = {
+            handle.label: handle
+            for handle in server.gui._gui_input_handle_from_uuid.values()
+            if hasattr(handle, "label")
+        }
+        run, beside = elements["Run"], elements["Beside"]
+        assert (run.value, beside.value) == ("early", ALONE)
+        assert beside.options == (ALONE, "early", "gone", "late")
+
+        def choose(handle: Any, name: str) -> None:
+            handle.value = name
+            notice = SimpleNamespace(add_notification=lambda *words, **_: told.append(words[1]))
+            for act in handle._impl.update_cb:
+                act(SimpleNamespace(client=notice))
+
+        seed = page._flight.record.seed
+        choose(run, "late")
+        assert page._run is runs.run("late") and len(page._pick.options) == 3
+        assert page._flight.record.seed == seed
+        assert page._flight is runs.run("late").flight(page._flight.record)
+        choose(beside, "early")
+        assert page._other is not None and page._other.record.seed == seed
+        assert page._part.visible
+        # What is damaged is told, and changes nothing.
+        choose(run, "gone")
+        choose(beside, "gone")
+        assert len(told) == 2 and all("gone" in each for each in told)
+        assert (run.value, beside.value) == ("late", "early")
+        choose(beside, ALONE)
+        assert page._other is None and not page._part.visible
+    finally:
+        server.stop()

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import viser
 
 from airl_mav.core.clock import Clock, WallClock
 from airl_mav.core.constants import US_PER_S
+from airl_mav.core.errors import UsageError
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.report.replay.flight import ReplayedFlight, parting_s
-from airl_mav.report.replay.runs import ReplayedRun
+from airl_mav.report.replay.runs import ReplayedRun, ReplayedRuns
 from airl_mav.view.look import OTHER
 from airl_mav.view.panel import Panel
 from airl_mav.view.scene import FlightScene
@@ -35,6 +37,9 @@ STEP_S = 0.02
 
 SPEEDS = {"0.1 x": 0.1, "0.25 x": 0.25, "0.5 x": 0.5, "1 x": 1.0, "2 x": 2.0, "5 x": 5.0}
 
+ALONE = "none"
+"""What is chosen to fly beside where nothing shall."""
+
 BEFORE_S = 0.5
 """It begins so long before the policy takes over [s]."""
 
@@ -48,6 +53,7 @@ class ReplayPage:
         run: ReplayedRun,
         beside: ReplayedRun | None = None,
         first: EpisodeRecord | None = None,
+        runs: ReplayedRuns | None = None,
     ) -> None:
         """Build the page, as it is at the beginning of the first flight.
 
@@ -56,8 +62,9 @@ class ReplayPage:
             run: What is replayed.
             beside: The run whose flights of the same seeds fly beside; None: alone.
             first: The flight that is shown first; None: the worst.
+            runs: Those that can be chosen, these two among them; None: no others.
         """
-        self._run, self._beside = run, beside
+        self._run, self._beside, self._runs = run, beside, runs
         self._shown, self._others = Shown(), Shown()
         self._scene = FlightScene(server)
         self._ghost = FlightScene(server, "/beside", OTHER)
@@ -85,6 +92,8 @@ class ReplayPage:
 
     def _add_head(self) -> None:
         gui = self._gui
+        if self._runs is not None and len(self._runs.names) > 1:
+            self._add_runs(self._runs)
         labels = tuple(self._records)
         self._pick = gui.add_dropdown("Flight", labels, initial_value=labels[0])
         self._time = gui.add_slider("time [s]", 0.0, 1.0, STEP_S, 0.0)
@@ -95,7 +104,8 @@ class ReplayPage:
         @self._pick.on_update
         def _(event: Any) -> None:
             if event.client is not None:
-                self._choose(self._records[self._pick.value])
+                chosen = self._records[self._pick.value]
+                self._told(event, lambda: self._choose(chosen))
 
         @self._time.on_update
         def _(event: Any) -> None:
@@ -115,6 +125,33 @@ class ReplayPage:
             if self._other is not None and (at := parting_s(self._flight, self._other)) is not None:
                 self._playing = False
                 self._go_to(at)
+
+    def _add_runs(self, runs: ReplayedRuns) -> None:
+        now, beside = runs.name_of(self._run), self._beside
+        there = ALONE if beside is None else runs.name_of(beside)
+        flown = self._gui.add_dropdown("Run", runs.names, initial_value=now)
+        other = self._gui.add_dropdown("Beside", (ALONE, *runs.names), initial_value=there)
+
+        @flown.on_update
+        def _(event: Any) -> None:
+            if event.client is not None and not self._told(event, lambda: self._fly(flown.value)):
+                flown.value = runs.name_of(self._run)
+
+        @other.on_update
+        def _(event: Any) -> None:
+            name = other.value
+            if event.client is not None and not self._told(event, lambda: self._pair(name)):
+                other.value = ALONE if self._beside is None else runs.name_of(self._beside)
+
+    @staticmethod
+    def _told(event: Any, act: Callable[[], None]) -> bool:
+        """Do something; where that cannot be, tell it on the page and return False."""
+        try:
+            act()
+        except UsageError as error:
+            event.client.add_notification("It cannot be shown", str(error), color="red")
+            return False
+        return True
 
     # --- where it is
 
@@ -137,6 +174,30 @@ class ReplayPage:
             flight.surround(self._shown)
             self._accompany(way.record)
             self.draw()
+
+    def _fly(self, name: str) -> None:
+        """Show another run: its flight of the same seed, or else its worst. Raises UsageError."""
+        if self._runs is None:
+            return
+        run = self._runs.run(name)
+        record = run.same(self._flight.record) or run.records[0]
+        run.flight(record)
+        self._run = run
+        self._records = {_label(each): each for each in run.records}
+        self._pick.options = tuple(self._records)
+        self._panel.name(run.title)
+        self._choose(record)
+
+    def _pair(self, name: str) -> None:
+        """Let flights of another run fly beside, or none. Raises UsageError."""
+        if self._runs is None:
+            return
+        beside = None if name == ALONE else self._runs.run(name)
+        if beside is not None and (same := beside.same(self._flight.record)) is not None:
+            beside.flight(same)
+        self._beside = beside
+        self._part.visible = beside is not None
+        self._accompany(self._flight.record)
 
     def _choose(self, record: EpisodeRecord) -> None:
         """Show another flight, from its beginning."""

@@ -2,16 +2,61 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.flight.record import NO_ARENA, EpisodeRecord
 from airl_mav.profiles.vehicle import VehicleProfile
-from airl_mav.rehearsal.run_folder import LoadedRun, load
+from airl_mav.rehearsal.run_folder import CAMPAIGN_FILE, RUN_FILE, LoadedRun, load
 from airl_mav.report.arenas import arenas_of, spec_of, vehicle_of
 from airl_mav.report.forensics.ranking import ranked
 from airl_mav.report.replay.flight import ReplayedFlight
+
+
+def run_folders(path: Path) -> list[Path]:
+    """Return the folders of a campaign's runs, by their names; of anything else the path itself.
+
+    Raises UsageError for a campaign of which nothing has been flown.
+    """
+    if not (path / CAMPAIGN_FILE).is_file():
+        return [path]
+    found = sorted(file.parent for file in path.glob(f"*/{RUN_FILE}"))
+    if not found:
+        raise UsageError(f"{path}: a campaign of which no run has begun")
+    return found
+
+
+class ReplayedRuns:
+    """Runs that can be chosen, each read when it is asked for."""
+
+    def __init__(self, folders: Iterable[Path]) -> None:
+        """Name them by their folders; by all of their paths where two have the same name."""
+        paths = list(dict.fromkeys(folders))
+        short = [path.name for path in paths]
+        names = short if len(set(short)) == len(short) else [str(path) for path in paths]
+        self._folders = dict(zip(names, paths, strict=True))
+        self._read: dict[str, ReplayedRun] = {}
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What they are called."""
+        return tuple(self._folders)
+
+    def name_of(self, run: ReplayedRun) -> str:
+        """Return what one of them is called."""
+        return next(name for name, path in self._folders.items() if path == run.path)
+
+    def at(self, folder: Path) -> ReplayedRun:
+        """Return the run of a folder. Raises UsageError as `ReplayedRun`."""
+        return self.run(next(name for name, path in self._folders.items() if path == folder))
+
+    def run(self, name: str) -> ReplayedRun:
+        """Return one of them. Raises UsageError as `ReplayedRun`."""
+        if name not in self._read:
+            self._read[name] = ReplayedRun(self._folders[name])
+        return self._read[name]
 
 
 class ReplayedRun:
