@@ -99,14 +99,21 @@ class RunningProgram:
         return found
 
 
-def program_at(host: str, port: int) -> int | None:
-    """Return the process id of whose TCP connection has this local address; None: not known.
+def program_at(host: str, port: int, to_port: int) -> int | None:
+    """Return the process id of whose TCP connection this is; None: not known.
 
     Nobody is found among the processes of other users, nor on other machines.
+
+    Args:
+        host: Its address, as it is seen from here.
+        port: Its port.
+        to_port: The port that it has connected to: its own may be another program's, too, for a
+            connection to somewhere else.
     """
     with suppress(psutil.Error, OSError):
         for connection in psutil.net_connections("tcp4"):
-            if connection.laddr and tuple(connection.laddr) == (host, port):
+            own, other = connection.laddr, connection.raddr
+            if own and other and tuple(own) == (host, port) and other.port == to_port:
                 return None if connection.pid in (None, os.getpid()) else int(connection.pid)
     return None
 

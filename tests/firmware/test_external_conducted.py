@@ -237,9 +237,11 @@ def test_a_program_is_found_by_its_connection() -> None:
             child.stdin.flush()
             connection, address = server.accept()
             with connection:
-                assert program_at(*address) == child.pid
-                # This process's own is nobody to wait for.
-                assert program_at(LOOPBACK, port) is None
+                assert program_at(address[0], address[1], port) == child.pid
+                # The same port of its own, but for another connection, and this process's own end,
+                # are nobody to wait for.
+                assert program_at(address[0], address[1], port + 1) is None
+                assert program_at(LOOPBACK, port, address[1]) is None
             child.kill()
 
 

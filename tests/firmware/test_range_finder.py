@@ -371,7 +371,9 @@ def distance_message(**changes: Any) -> Any:
     return dialect.MAVLink_distance_sensor_message(**{**fields, **changes})
 
 
-@pytest.mark.parametrize(("told", "quality"), [(0, -1), (1, 0), (100, 100), (50, 49)])
+@pytest.mark.parametrize(
+    ("told", "quality"), [(0, -1), (1, 0), (100, 100), (50, 49), (101, 100), (255, 100)]
+)
 def test_what_a_client_s_sensor_says(told: int, quality: int) -> None:
     (reading,) = read(distance_message(signal_quality=told))
     assert reading.distance_m == pytest.approx(3.45)

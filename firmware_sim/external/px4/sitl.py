@@ -134,7 +134,7 @@ class Px4Bridge:
                 f"PX4 did not connect to TCP port {self.port} within {timeout_s:g} s: is it "
                 f"running, with PX4_SIM_MODEL={MODEL} and -i {self.port - SIMULATOR_PORT}?"
             )
-        pid = program_at(*self._tcp.peer)
+        pid = program_at(*self._tcp.peer, self.port)
         if pid is not None:
             self._program = RunningProgram(pid, UNAWAITED_THREADS)
 

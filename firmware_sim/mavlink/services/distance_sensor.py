@@ -31,5 +31,8 @@ def handle(message: WireMessage, context: Context) -> bool:
 
 
 def quality_of(signal_quality: int) -> int:
-    """Return a quality [%] of the field's 1 (invalid) to 100, 0 = not told; -1 = not told."""
-    return _UNKNOWN if signal_quality == 0 else 100 * (signal_quality - 1) // 99
+    """Return a quality [%] of the field's 1 (invalid) to 100, 0 = not told; -1 = not told.
+
+    More than the field's greatest is taken for that; PX4's byte would overflow.
+    """
+    return _UNKNOWN if signal_quality == 0 else 100 * (min(signal_quality, 100) - 1) // 99
