@@ -78,8 +78,8 @@ class TerrainFilter:
         self._inner.restart(covariance)
         alone = np.count_nonzero(covariance, axis=1) <= 1
         self.cross[alone] = 0.0
-        known = np.linalg.solve(covariance + 1e-12 * np.eye(es.N_STATES), self.cross)
-        if float(self.cross @ known) > self.variance:
+        known = _solved(covariance + 1e-12 * np.eye(es.N_STATES), self.cross)
+        if known is None or not float(self.cross @ known) <= self.variance:
             self.cross[:] = 0.0
 
     def fuse(self, state: Vector, innovation: Vector, h: Vector, variance: Vector) -> float:
@@ -103,7 +103,10 @@ class TerrainFilter:
         ratio = self._inner.fuse(state, innovation, h, variance)
         if ratio <= 1.0:
             by_ground = h @ self.cross
-            weights = np.linalg.solve(totals, by_ground)
+            weights = _solved(totals, by_ground)
+            if weights is None:
+                self.cross[:] = 0.0
+                return ratio
             self.down += float(weights @ innovation)
             self.variance -= float(by_ground @ weights)
             self.cross = self.cross - spread @ weights
@@ -190,3 +193,14 @@ class TerrainFilter:
         p, z = self._inner.covariance, es.POS + 2
         self.down += innovation
         self.variance, self.cross = float(p[z, z]) + variance, p[:, z].copy()
+
+
+def _solved(matrix: Vector, right: Vector) -> Vector | None:
+    """Return x of matrix x = right; None: the matrix is singular.
+
+    Variances that a client has stated may lie further apart than numbers are exact.
+    """
+    try:
+        return np.asarray(np.linalg.solve(matrix, right), np.float64)
+    except np.linalg.LinAlgError:
+        return None

@@ -117,3 +117,17 @@ def test_ground_has_nothing_to_do_with_a_height_that_is_put_elsewhere() -> None:
     joint[:-1, :-1], joint[-1, -1] = found.covariance, found.variance
     joint[:-1, -1] = joint[-1, :-1] = found.cross
     assert np.linalg.eigvalsh(joint).min() > 0.0
+
+
+def test_variances_without_measure_end_nothing() -> None:
+    """Those that a client states may make a matrix that is singular to what numbers can hold."""
+    terrain = TerrainFilter(KernelFilter(np.diag(es.INITIAL_SIGMA**2), NOISE))
+    terrain.put(0.0, 1.0)
+    terrain.cross[Z] = 0.1
+    apart = np.full((es.N_STATES, es.N_STATES), 1e38)
+    terrain.restart(apart)
+    assert not terrain.cross.any() and terrain.variance == 1.0
+    terrain.cross[Z] = 0.1
+    h = selecting(es.POS, es.POS)
+    terrain.fuse(es.new_state(), np.zeros(2), h, np.zeros(2))
+    assert np.isfinite(terrain.cross).all() and np.isfinite(terrain.down)
