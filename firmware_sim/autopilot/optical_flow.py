@@ -170,7 +170,6 @@ class OpticalFlow:
         compensated = rate - gyro[:2]
         variance = self._variance(reading.quality)
         self._test(compensated, gyro, variance)
-        self._smooth(compensated)
         least_quality = value("EKF2_OF_QMIN" if flying else "EKF2_OF_QMIN_GND")
         fast = max(math.hypot(*rate.tolist()), math.hypot(*compensated.tolist()))
         good = (
@@ -178,6 +177,9 @@ class OpticalFlow:
             and fast <= GREATEST_RAD_S
             and self._rotation[2, 2] > _COS_GREATEST_TILT
         )
+        if good:
+            # PX4 smooths what it does not believe, too: the velocity may be put to that.
+            self._smooth(compensated)
         height = self._terrain.down - self._state.item(es.P + 2)
         possible = LEAST_HEIGHT_M <= height <= GREATEST_HEIGHT_M
         tells_ground = not ground.is_reference

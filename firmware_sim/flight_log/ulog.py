@@ -6,15 +6,19 @@ message is the length of its content, its type, and its content.
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 from airl_mav.core.log_file import LogFile
 
 Values = tuple[float | int | bool, ...]
+
+_GREATEST_SINGLE = struct.unpack("<f", b"\xff\xff\x7f\x7f")[0]
 
 _MAGIC = b"\x55\x4c\x6f\x67\x01\x12\x35"
 _VERSION = 1
@@ -106,12 +110,18 @@ class UlogWriter(LogFile):
     def sample(self, number: int, time_us: int, values: Values) -> None:
         """Add one sample of topic `number`, taken at simulated `time_us` [µs].
 
+        A number beyond those of single precision is infinite in the log, as on the aircraft.
+
         Raises struct.error when the values are not those of the topic's fields.
         """
         layout = self._samples[number]
         self._now_us = time_us
         head = _HEAD.pack(layout.size, ord("D"))
-        self.add(time_us, head, layout.pack(number, time_us, *values))
+        try:
+            data = layout.pack(number, time_us, *values)
+        except OverflowError:
+            data = layout.pack(number, time_us, *map(_single, values))
+        self.add(time_us, head, data)
 
     def text(self, time_us: int, severity: int, text: str) -> None:
         """Add a text of simulated `time_us` [µs], of severity 0 (emergency) to 7 (debug)."""
@@ -140,3 +150,10 @@ def _whole(key: str, value: int) -> bytes:
 def _keyed(kind: str, key: str, data: bytes) -> bytes:
     described = f"{kind} {key}".encode("ascii")
     return bytes([len(described)]) + described + data
+
+
+def _single(value: Any) -> Any:
+    """Return a number as single precision has it, if it is one with a fraction."""
+    if not isinstance(value, float) or abs(value) <= _GREATEST_SINGLE:
+        return value
+    return math.copysign(math.inf, value)

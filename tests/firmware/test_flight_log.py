@@ -80,6 +80,16 @@ def test_what_is_written_is_read(tmp_path: Path) -> None:
     assert data["exact"].tolist() == [1e-300, 0.1]
 
 
+def test_numbers_beyond_single_precision_are_infinite(tmp_path: Path) -> None:
+    path = tmp_path / "log.ulg"
+    log = UlogWriter(path, 0, [ANSWER], [], [])
+    log.sample(0, 4_000, (1e39, -1e40, 3.5, 7, True, 0.25))
+    log.close()
+    data = topic(ULog(str(path)), "answer")
+    assert [data[f"xyz[{i}]"].item() for i in range(3)] == [np.inf, -np.inf, 3.5]
+    assert (data["number"].item(), data["exact"].item()) == (7, 0.25)
+
+
 def test_a_killed_writer_leaves_a_readable_part(tmp_path: Path) -> None:
     path = tmp_path / "killed.ulg"
     script = (

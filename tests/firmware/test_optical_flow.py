@@ -245,6 +245,25 @@ def tampered(rig: Rig, change: Callable[[FlowReading], FlowReading | None]) -> N
     rig.step_through(lambda sample: step(changed(sample)))
 
 
+def test_absurd_flow_has_no_part_in_where_the_velocity_is_put() -> None:
+    rig = flown_by_flow()
+    rig.take_off(2.5)
+    fails, rng = [True], np.random.default_rng(5)
+
+    def absurd(told: FlowReading) -> FlowReading:
+        if not fails[0]:
+            return told
+        return told._replace(flow=1e30 * rng.standard_normal(2), interval_s=1e-6, quality=BEST)
+
+    tampered(rig, absurd)
+    rig.run(1.5)
+    fails[0] = False
+    rig.run(4.0)
+    assert flow_of(rig).fused
+    estimate = rig.ap.estimator.estimate()
+    assert np.abs(estimate.velocity - rig.truth.velocity).max() < 0.2
+
+
 def test_a_low_quality_is_not_fused_in_the_air() -> None:
     rig = flown_by_flow(EKF2_OF_QMIN=60)
     rig.take_off(2.5)
