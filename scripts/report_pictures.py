@@ -29,7 +29,10 @@ WAIT_S = 120.0
 def main() -> None:
     """Write the pictures of a run that has its report."""
     page_file = Path(sys.argv[1]).resolve() / "report.html"
-    with tempfile.TemporaryDirectory() as folder, browser(Path(folder)) as page:
+    with (
+        tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder,
+        browser(Path(folder)) as page,
+    ):
         page.resize(WIDTH, FIRST_HIGH)
         page.open(page_file.as_uri())
         wait_until_drawn(page)

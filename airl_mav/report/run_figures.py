@@ -97,6 +97,7 @@ def latency_figure(stage: Stage, samples: Samples, summary: Summary) -> theme.Pi
         bottom.xaxis.set_major_locator(MaxNLocator(5))
     for ax in (top, bottom):
         theme.plain_axes(ax)
+    theme.share_grid((top, bottom))
     alt = f"Histogram and cumulated distribution of {stage.title}: {stage.meaning}"
     return theme.render(figure, f"latency-{stage.key.replace('_', '-')}", alt)
 

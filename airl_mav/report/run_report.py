@@ -9,6 +9,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.text import Text
 
+from airl_mav.core.collecting import seldom_collected
 from airl_mav.core.progress import DRAWING, Progress
 from airl_mav.flight.requirements import Requirement
 from airl_mav.flight.statistics import aggregate
@@ -54,6 +55,7 @@ def verdict_of(run: LoadedRun, requirements: Sequence[Requirement] | None = None
     return replace(verdict, sentences=verdict.sentences + unchecked([run.info]))
 
 
+@seldom_collected()
 def write_report(
     run: LoadedRun | Path, out: Path | None = None, verdict: OverallVerdict | None = None
 ) -> Path:

@@ -117,6 +117,8 @@ def timeline_figure(timeline: Timeline, stages: Sequence[Stage]) -> theme.Pictur
     theme.label_axes(rows[-1], label)
     rows[-1].set_xlim(-0.5, len(timeline) - 0.5)
     rows[-1].xaxis.set_major_locator(MaxNLocator(10, integer=True))
+    for ax in rows[:-1]:
+        ax.xaxis.set_visible(False)
     alt = "Duration of each stage of every decision in the order flown, outliers marked: " + (
         ", ".join(stage.title for stage in stages)
     )

@@ -8,7 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.image import BboxImage
 from matplotlib.lines import Line2D
+from matplotlib.transforms import Bbox, TransformedBbox
 from numpy.typing import NDArray
 
 from airl_mav.report import theme
@@ -21,7 +23,7 @@ TIME_POINTS = 300
 """A line has at most this many corners."""
 
 WIDTH_IN, ROW_IN, STRIP_IN = 5.2, 0.86, 0.78
-LEFT_IN, RIGHT_IN = 0.62, 0.12
+LEFT_IN, RIGHT_IN = 0.68, 0.12
 
 BEFORE_S = 2.0
 """So much of the take-off is shown [s]; all of it where it was not finished."""
@@ -67,10 +69,9 @@ def tracking_figure(
     keep = np.unique(np.linspace(first, len(t) - 1, TIME_POINTS).astype(int))
     for ax, (label, lines) in zip(axes, rows, strict=True):
         _draw_row(ax, flight, label, lines, keep)
-    for image, ax in zip(seen, _strip(figure, seen, height), strict=True):
-        ax.imshow(pictured(image.image, range_m), interpolation="nearest", aspect="equal")
+    for k, image in enumerate(seen):
         at = flight.commands.sent_s[min(image.number, len(flight.commands.sent_s) - 1)]
-        ax.set_title(f"{at:.1f} s", fontsize=7.5, color=theme.MUTED, pad=2)
+        _draw_image(figure, k, pictured(image.image, range_m), f"{at:.1f} s")
         for row in axes:
             row.axvline(at, color=theme.MUTED, lw=0.6, ls=":", zorder=1)
     if t[first] < 0.0:
@@ -79,6 +80,7 @@ def tracking_figure(
             textcoords="offset points", va="top", fontsize=8, color=theme.MUTED,
         )  # fmt: skip
     theme.label_axes(axes[-1], "time since the start of navigation [s]")
+    theme.share_grid(list(axes))
     figure.legend(
         handles=_legend(flight), loc="upper left", bbox_to_anchor=(LEFT_IN / WIDTH_IN, 1.0),
         ncols=3, frameon=False, fontsize=8, labelcolor=theme.INK, borderaxespad=0.1,
@@ -111,10 +113,10 @@ def _rows(flight: TrackedFlight) -> list[tuple[str, list[_Line]]]:
         lines.append(_Line(asked, COMMANDED, "-", 0.9))
     rows.append(("height\n[m]", lines))
     tilt = [_Line(flown.roll_deg, FLOWN), _Line(flown.pitch_deg, FLOWN, ":")]
-    rows.append(("roll, pitch:\ndotted [°]", tilt))
+    rows.append(("roll [°]\npitch: dotted", tilt))
     if errors is not None:
         away = [_Line(errors.aside_m, ESTIMATED), _Line(errors.height_m, ESTIMATED, ":")]
-        rows.append(("error of est.\n[m], height:\ndotted", away))
+        rows.append(("est. error [m]\nheight: dotted", away))
     rows.append(("power\n[W]", [_Line(flight.power_w, FLOWN)]))
     if flight.motors is not None:
         rows.append(("motor\noutputs", [_Line(each, FLOWN, "-", 0.7) for each in flight.motors.T]))
@@ -160,17 +162,30 @@ def _mean_power(flight: TrackedFlight, keep: NDArray[np.int64]) -> Floats:
     return power
 
 
-def _strip(figure: Figure, seen: Sequence[SeenDecision], height: float) -> list[Axes]:
-    """Return axes for the images, side by side above the rows."""
-    width = (WIDTH_IN - LEFT_IN - RIGHT_IN) / IMAGES
-    axes = []
-    for k in range(len(seen)):
-        left = (LEFT_IN + k * width + 0.04) / WIDTH_IN
-        bottom = (height - 0.3 - STRIP_IN + 0.04) / height
-        ax = figure.add_axes((left, bottom, (width - 0.08) / WIDTH_IN, (STRIP_IN - 0.2) / height))
-        ax.axis("off")
-        axes.append(ax)
-    return axes
+def _draw_image(figure: Figure, place: int, image: NDArray[np.uint8], title: str) -> None:
+    """Draw an image (rows, columns, 3) above the rows, at a place from the left, under its title.
+
+    It has no axes: those would cost more than all else of it.
+    """
+    width, height = (float(inches) for inches in figure.get_size_inches())
+    room = (WIDTH_IN - LEFT_IN - RIGHT_IN) / IMAGES
+    centre = LEFT_IN + (place + 0.5) * room
+    bottom, tall, wide = height - 0.3 - STRIP_IN + 0.04, STRIP_IN - 0.2, room - 0.08
+    # As large as fits, in its own proportions.
+    scale = min(wide / image.shape[1], tall / image.shape[0])
+    across, up = scale * image.shape[1], scale * image.shape[0]
+    left, low = centre - 0.5 * across, bottom + 0.5 * (tall - up)
+    inches = Bbox.from_bounds(left, low, across, up)
+    box = TransformedBbox(inches, figure.dpi_scale_trans)
+    # Each by itself: joined to one image of all, they would be resampled once more.
+    figure.suppressComposite = True
+    drawn = BboxImage(box, interpolation="nearest")
+    drawn.set_data(image)
+    figure.add_artist(drawn)
+    figure.text(
+        centre / width, (low + up + 2.0 / 72.0) / height, title,
+        ha="center", va="baseline", fontsize=7.5, color=theme.MUTED,
+    )  # fmt: skip
 
 
 def _legend(flight: TrackedFlight) -> list[Line2D]:

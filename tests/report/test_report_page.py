@@ -135,7 +135,11 @@ def probe(page: Path, size: tuple[int, int], *flags: str) -> dict[str, Any]:
     spy = page.with_name("probe.html")
     spied = text.replace("<style>", WATCH + "<style>", 1).replace("</body>", PROBE + "</body>")
     spy.write_text(spied, encoding="utf-8")
-    with TemporaryDirectory() as folder, browser(Path(folder), *flags) as tab:
+    with (
+        # Chromium's own processes may still write into its profile when it has ended.
+        TemporaryDirectory(ignore_cleanup_errors=True) as folder,
+        browser(Path(folder), *flags) as tab,
+    ):
         tab.resize(*size, phone=size[0] < 500)
         tab.open(spy.as_uri())
         wait_for(tab, "document.getElementById('probe')")
