@@ -18,6 +18,7 @@ from rich.table import Table
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.bvh import Meshes
 from airl_mav.camera.colour import Work, render_colour
+from airl_mav.camera.gloss import Gloss
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.picture import ColourArrays
 from airl_mav.camera.projection import Bent
@@ -50,6 +51,7 @@ def colour_all(
     per_m: NDArray[np.float32],
     offset: NDArray[np.float32],
     albedo: NDArray[np.float32],
+    gloss: Gloss | None,
     lights: NDArray[np.float32],
     patterns: NDArray[np.float32],
     bent: Bent | None,
@@ -58,8 +60,8 @@ def colour_all(
         p, q = position[i], attitude[i]
         render_colour(
             rgb, depth, seen, work, (p[0], p[1], p[2]), (q[0], q[1], q[2], q[3]), focal, cx, cy,
-            False, bounds, shape, center, half, yaw, meshes, texture, per_m, offset, albedo, lights,
-            patterns, bent,
+            False, bounds, shape, center, half, yaw, meshes, texture, per_m, offset, albedo, gloss,
+            lights, patterns, bent,
         )  # fmt: skip
 
 
@@ -71,7 +73,7 @@ def rates(arena: Arena, k: Intrinsics, poses: tuple[np.ndarray, np.ndarray]) -> 
     work = Work.of(k.width, k.height, False)
     lens, bounds = (k.focal, k.cx, k.cy), arena.bounds.as_array()
     bodies = (*poses, *lens, bounds, o.shape, o.center, o.half_size, o.yaw, None)
-    surfaces = (look.texture, look.per_m, look.offset, look.albedo, look.lights, patterns)
+    surfaces = (look.texture, look.per_m, look.offset, look.albedo, None, look.lights, patterns)
     coloured = (*bodies, *surfaces)
     times: tuple[list[float], list[float]] = ([], [])
     for _ in range(ROUNDS):

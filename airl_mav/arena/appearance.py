@@ -11,7 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.core.streams import Stream, stream
-from airl_mav.profiles.appearance import Appearance, Material, Surfaces, TextureName
+from airl_mav.profiles.appearance import (
+    Appearance,
+    Material,
+    SurfaceName,
+    Surfaces,
+    TextureName,
+)
 from airl_mav.profiles.image_file import ImageFile
 
 Floats = NDArray[np.float64]
@@ -19,6 +25,9 @@ Rgb = tuple[int, int, int]
 
 TEXTURES: tuple[str, ...] = get_args(TextureName)
 """Texture of each number in `Finish.texture`."""
+
+SURFACES: tuple[str, ...] = get_args(SurfaceName)
+"""How the surfaces with each number in `Finish.surface` reflect."""
 
 FLOOR, WALLS, OBSTACLE = 0, 1, 2
 """Rows of a `Finish`: obstacle i has row OBSTACLE + i."""
@@ -47,6 +56,8 @@ class Finish:
     albedo: Floats  # (m, 2, 3) linear RGB 0..1 where the texture is 0, and where it is 1
     size_m: Floats  # (m,) `Material.size_m`
     offset: Floats  # (m, 2) where the pattern begins, in its periods, 0..1
+    surface: NDArray[np.int8]  # (m,) number in SURFACES
+    roughness: Floats  # (m,) `Material.roughness`
     images: tuple[ImageFile, ...] = ()
     """Pictures that surfaces may have."""
 
@@ -144,8 +155,18 @@ def draw_appearance(
         for part, kind, n in kinds
         if n
     ]
-    texture, albedo, size, offset = (np.concatenate(parts) for parts in zip(*rows, strict=True))
-    finish = Finish(texture.astype(np.int8), albedo, size, offset, appearance.images)
+    texture, albedo, size, offset, surface, roughness = (
+        np.concatenate(parts) for parts in zip(*rows, strict=True)
+    )
+    finish = Finish(
+        texture.astype(np.int8),
+        albedo,
+        size,
+        offset,
+        surface.astype(np.int8),
+        roughness,
+        appearance.images,
+    )
     return Drawn(finish, _light(appearance, draw))
 
 
@@ -156,8 +177,8 @@ def _surfaces(
     appearance: Appearance,
     wall_colour: Rgb,
     statics: Statics | None,
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """Draw n surfaces of a kind: texture, albedos, size and offset, as in `Finish`.
+) -> tuple[Floats, ...]:
+    """Draw n surfaces of a kind: texture, albedos, size, offset, ..., in the order of `Finish`.
 
     Everything is drawn whether or not it is used, and surface by surface: neither a knob nor the
     number of surfaces changes the other draws. The parts of a thing of `statics` share its draws.
@@ -178,7 +199,16 @@ def _surfaces(
     albedo = np.array([_albedos(material) for material in materials])[chosen] * factor[:, None]
     texture = np.array([_number(material, appearance) for material in materials], np.float64)
     size = np.array([material.size_m for material in materials])
-    return texture[chosen], np.clip(albedo, 0.0, 1.0), size[chosen], draws[:, 5:]
+    surface = np.array([SURFACES.index(material.surface) for material in materials], np.float64)
+    rough = np.array([material.roughness for material in materials])
+    return (
+        texture[chosen],
+        np.clip(albedo, 0.0, 1.0),
+        size[chosen],
+        draws[:, 5:],
+        surface[chosen],
+        rough[chosen],
+    )
 
 
 def image_number(k: int) -> int:

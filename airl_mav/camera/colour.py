@@ -16,12 +16,14 @@ from airl_mav.arena.appearance import FLOOR as FLOOR_ROW
 from airl_mav.arena.appearance import OBSTACLE as OBSTACLE_ROW
 from airl_mav.arena.appearance import WALLS as WALLS_ROW
 from airl_mav.camera.bvh import Meshes, count_of, is_owned, raised
+from airl_mav.camera.gloss import Gloss, let_through
 from airl_mav.camera.mesh_shadows import shade_by_meshes
 from airl_mav.camera.mesh_surfaces import shade_meshes
 from airl_mav.camera.mesh_triangles import Faces
 from airl_mav.camera.primitives import FLOOR, GROUND, OBSTACLE, SKY, Ids, Rectangles
 from airl_mav.camera.projection import MIN_DEPTH_M, Bent, Pose, View
 from airl_mav.camera.raycast import aim, blank, draw_bodies, invert
+from airl_mav.camera.reflections import Look, draw_reflections
 from airl_mav.camera.shading import F32, ZERO, Lit, Packed, Plane, Points, Rays, surface_of
 from airl_mav.camera.shadows import CORNERS, shade_by_obstacle, shade_by_walls
 from airl_mav.camera.surfaces import (
@@ -100,6 +102,7 @@ def render_colour(
     per_m: NDArray[np.float32],
     offset: NDArray[np.float32],
     albedo: NDArray[np.float32],
+    gloss: Gloss | None,
     lights: NDArray[np.float32],
     atlas: Plane,
     bent: Bent | None,
@@ -130,6 +133,7 @@ def render_colour(
         per_m: (2 + n,) periods of the pattern for a metre.
         offset: (2 + n, 2) `Finish.offset`.
         albedo: (2 + n, 2, 3) `Finish.albedo`.
+        gloss: What surfaces are beside matt; None: all are, and nothing is spent on it.
         lights: (7, 3) direction of the sun, its irradiance, that of the sky, the floor's mean
             radiosity, zenith, horizon; then the fog's extinction [1/m] in the first column.
         atlas: `textures.atlas()`.
@@ -151,7 +155,7 @@ def render_colour(
     invert(far)
     _show(
         rgb, far, ids, rectangles, faces, work, bent, view, axes, camera, bounds, shape, center,
-        half_size, yaw, meshes, texture, per_m, offset, albedo, lights, atlas,
+        half_size, yaw, meshes, texture, per_m, offset, albedo, gloss, lights, atlas,
     )  # fmt: skip
     if cylindrical:
         depth[:, :] = far.T
@@ -195,6 +199,7 @@ def _show(
     per_m: NDArray[np.float32],
     offset: NDArray[np.float32],
     albedo: NDArray[np.float32],
+    gloss: Gloss | None,
     lights: NDArray[np.float32],
     atlas: Plane,
 ) -> None:
@@ -221,6 +226,7 @@ def _show(
         per_m: (2 + n,).
         offset: (2 + n, 2).
         albedo: (2 + n, 2, 3).
+        gloss: As of `render_colour`.
         lights: (7, 3).
         atlas: Of all textures.
     """
@@ -233,7 +239,8 @@ def _show(
     all_ids, all_far = ids.reshape(count), far.reshape(count)
     all_lit, all_clear = lit.reshape(count), clear.reshape(count)
     extinction = float(light.extinction)
-    shade_by_walls(all_lit, all_clear, all_far, rays, camera, bounds, to_sun, extinction)
+    through = let_through(gloss, WALLS_ROW)
+    shade_by_walls(all_lit, all_clear, all_far, rays, camera, bounds, to_sun, extinction, through)
     sunny = max(max(light.sun[0], light.sun[1]), light.sun[2]) > ZERO
     for i in range(len(shape)):
         if sunny:
@@ -242,12 +249,13 @@ def _show(
             world, half = _placed(axes, camera, center, half_size, i)
             shade_by_obstacle(
                 lit, far, ids, work.corners, i, lines, xs, bent, view, world, camera, shape[i],
-                half, yaw[i], to_sun,
+                half, yaw[i], to_sun, let_through(gloss, OBSTACLE_ROW + i),
             )  # fmt: skip
     if meshes is not None and faces is not None and sunny:
         shade_by_meshes(
-            lit, far, ids, faces, work.corners, lines, xs, bent, view, axes, camera, meshes, to_sun
-        )
+            lit, far, ids, faces, work.corners, lines, xs, bent, view, axes, camera, meshes, to_sun,
+            gloss,
+        )  # fmt: skip
     draw_sky(out, all_ids, points, rays, camera, light)
     pixel2 = F32(1.0 / (view.focal * view.focal))
     floor = surface_of(texture, per_m, offset, albedo, FLOOR_ROW)
@@ -274,6 +282,11 @@ def _show(
                 out, all_ids, all_far, all_lit, all_clear, points, rectangles[i, k], i, lines, xs,
                 bent, world, shape[i], half, yaw[i], surface, light, atlas, pixel2,
             )  # fmt: skip
+    if gloss is not None:
+        look = Look(texture, per_m, offset, albedo, gloss, light, atlas, pixel2)
+        draw_reflections(
+            out, all_ids, rays, camera, bounds, shape, center, half_size, yaw, meshes, look
+        )
     if bent is not None:
         _blacken(out, bent)
     unpack(rgb, out, view.cylindrical)

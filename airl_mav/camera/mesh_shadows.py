@@ -11,14 +11,16 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.camera.bvh import STACK, Bvh, Meshes
+from airl_mav.camera.bvh import STACK, Meshes, material_row
+from airl_mav.camera.gloss import Gloss, let_through
+from airl_mav.camera.mesh_rays import stopped_by
 from airl_mav.camera.mesh_triangles import Faces
 from airl_mav.camera.meshes import inverse_of, seen_from
 from airl_mav.camera.primitives import OBSTACLE, SKY, Ids, Line, Lines
 from airl_mav.camera.projection import Bent, Pose, View, dot, ray_of
 from airl_mav.camera.shading import F32, ZERO, Plane
 from airl_mav.camera.shadows import along32, ray32, shadow_rectangle, start32, widened
-from airl_mav.core.kernels import borrowing_kernel, large_borrowing_kernel, large_kernel
+from airl_mav.core.kernels import large_borrowing_kernel, large_kernel
 from airl_mav.vehicle.rotation import Vec
 
 _ABOVE_M: Final = 5e-4
@@ -43,6 +45,7 @@ def shade_by_meshes(
     camera: Vec,
     meshes: Meshes,
     to_sun: Vec,
+    gloss: Gloss | None,
 ) -> None:
     """Put the points that meshes hide from the sun into shadow.
 
@@ -60,12 +63,14 @@ def shade_by_meshes(
         camera: (3,) NED [m].
         meshes: Those of the arena.
         to_sun: (3,) unit vector NED.
+        gloss: What the surfaces let through; None: nothing.
     """
     waiting, maybe = np.empty(STACK, np.int32), np.empty(len(xs), np.bool_)
     for k in range(len(meshes.root)):
+        through = let_through(gloss, material_row(meshes, k))
         _shade_by_mesh(
             lit, far, ids, faces, corners, lines, xs, bent, view, axes, camera, meshes, k, to_sun,
-            waiting, maybe,
+            through, waiting, maybe,
         )  # fmt: skip
 
 
@@ -85,10 +90,14 @@ def _shade_by_mesh(
     meshes: Meshes,
     k: int,
     to_sun: Vec,
+    through: np.float32,
     waiting: NDArray[np.int32],
     maybe: NDArray[np.bool_],
 ) -> None:
-    """Put the points that mesh k hides into shadow; `maybe` (m,) is room to work in."""
+    """Put the points that mesh k hides into shadow; `maybe` (m,) is room to work in.
+
+    Of the sun's light it lets a share `through`.
+    """
     bvh, root, scale = meshes.bvh, meshes.root[k], meshes.pose[k, 4]
     cos, sin = meshes.pose[k, 2], meshes.pose[k, 3]
     pose = seen_from(axes, camera, meshes.pose, k)
@@ -153,86 +162,6 @@ def _shade_by_mesh(
                 if side * dot(normal, sun) <= 0.0:
                     continue
                 at = (at[0] + side * normal[0], at[1] + side * normal[1], at[2] + side * normal[2])
-            last = _hit(bvh, root, at, sun, inverse, above, last, waiting)
+            last = stopped_by(bvh, root, at, sun, inverse, above, last, waiting)
             if last >= 0:
-                lit_row[u] = ZERO
-
-
-@borrowing_kernel
-def _hit(
-    bvh: Bvh,
-    root: int,
-    at: Vec,
-    sun: Vec,
-    inverse: Vec,
-    least: float,
-    last: int,
-    waiting: NDArray[np.int32],
-) -> int:
-    """Return a triangle between a point and the sun, -1: there is none.
-
-    Args:
-        bvh: The trees.
-        root: The mesh's.
-        at: (3,) the point, from the mesh's origin, with all else in units of the mesh.
-        sun: (3,) unit vector.
-        inverse: (3,) one over each of its components.
-        least: Triangles nearer than this do not count.
-        last: One that hid the point before: it is likely to hide this one.
-        waiting: (STACK,) room to work in.
-    """
-    if last >= 0 and _stops(bvh.corners, last, at, sun, least):
-        return last
-    i0, i1, i2 = inverse
-    v0, v1, v2 = abs(i0), abs(i1), abs(i2)
-    boxes, links = bvh.boxes, bvh.links
-    tops, node = 0, root
-    while True:
-        a, b, c = (
-            (boxes[node, 0] - at[0]) * i0,
-            (boxes[node, 1] - at[1]) * i1,
-            (boxes[node, 2] - at[2]) * i2,
-        )
-        w0, w1, w2 = boxes[node, 3] * v0, boxes[node, 4] * v1, boxes[node, 5] * v2
-        enter = max(max(a - w0, b - w1), c - w2)
-        leave = min(min(a + w0, b + w1), c + w2)
-        if leave >= max(enter, least):
-            count = links[node, 1]
-            if count == 0:
-                waiting[tops] = links[node, 0]
-                tops += 1
-                node += 1
-                continue
-            first = links[node, 0]
-            for i in range(first, first + count):
-                if _stops(bvh.corners, i, at, sun, least):
-                    return i
-        if tops == 0:
-            return -1
-        tops -= 1
-        node = waiting[tops]
-
-
-@borrowing_kernel
-def _stops(corners: NDArray[np.float32], i: int, at: Vec, way: Vec, least: float) -> bool:
-    """Return whether a ray hits a triangle, from either side, no nearer than `least`.
-
-    Moller and Trumbore, Fast, minimum storage ray-triangle intersection, 1997.
-    """
-    p0, p1, p2 = float(corners[i, 0]), float(corners[i, 1]), float(corners[i, 2])
-    a0, a1, a2 = corners[i, 3] - p0, corners[i, 4] - p1, corners[i, 5] - p2
-    b0, b1, b2 = corners[i, 6] - p0, corners[i, 7] - p1, corners[i, 8] - p2
-    h0, h1, h2 = way[1] * b2 - way[2] * b1, way[2] * b0 - way[0] * b2, way[0] * b1 - way[1] * b0
-    volume = a0 * h0 + a1 * h1 + a2 * h2
-    if volume == 0.0:
-        return False
-    per = 1.0 / volume
-    s0, s1, s2 = at[0] - p0, at[1] - p1, at[2] - p2
-    u = per * (s0 * h0 + s1 * h1 + s2 * h2)
-    if u < 0.0 or u > 1.0:
-        return False
-    q0, q1, q2 = s1 * a2 - s2 * a1, s2 * a0 - s0 * a2, s0 * a1 - s1 * a0
-    v = per * (way[0] * q0 + way[1] * q1 + way[2] * q2)
-    if v < 0.0 or u + v > 1.0:
-        return False
-    return bool(per * (b0 * q0 + b1 * q1 + b2 * q2) >= least)
+                lit_row[u] *= through

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from airl_mav.camera.bvh import Meshes, material_row
 from airl_mav.camera.mesh_triangles import Faces
+from airl_mav.camera.patterns import STEEP, on_triangle, texels2
 from airl_mav.camera.primitives import OBSTACLE, Ids, Line, Lines, Rectangles, turned
 from airl_mav.camera.projection import Bent, Pose
 from airl_mav.camera.shading import (
@@ -24,7 +25,7 @@ from airl_mav.camera.shading import (
     texel_at,
 )
 from airl_mav.camera.shadows import along32, ray32, start32
-from airl_mav.camera.surfaces import STEEP, span_of, texels2
+from airl_mav.camera.surfaces import span_of
 from airl_mav.core.kernels import large_borrowing_kernel
 from airl_mav.vehicle.rotation import Vec
 
@@ -149,10 +150,7 @@ def _shade_mesh(
             # The side that is seen faces the camera.
             side = -ONE if normal > ZERO else ONE
             a, b, c = t * n - c0, t * e - c1, t * d - c2
-            q0, q1, q2 = abs(n0), abs(n1), abs(n2)
-            level = q2 >= max(q0, q1)
-            across = a if level or q1 > q0 else b
-            along = b if level else c
+            across, along = on_triangle(a, b, c, n0, n1, n2)
             texels = texel * t * t / max(abs(normal), STEEP)
             points.place[u] = texel_at(across * per_m + begin_u, along * per_m + begin_v, texels)
             points.facing[u] = max(side * (n0 * s0 + n1 * s1 + n2 * s2), ZERO)

@@ -21,6 +21,7 @@ from airl_mav.arena.ground import Ground
 from airl_mav.arena.triangles import standing, triangles_of
 from airl_mav.camera.colour import RANGE_M
 from airl_mav.camera.cube_faces import FACES, Cube, cube_of, resampled, side_for
+from airl_mav.camera.gloss import GLASS, GLOSSY, INDEX, METAL, is_smooth
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.textures import mean_of, periods, texels
 from airl_mav.core.errors import UsageError
@@ -96,7 +97,9 @@ class PathTracer:
         mi.set_variant(VARIANT)
         if arena is not self._arena or not np.array_equal(centers, self._centers):
             self._arena, self._centers = arena, np.array(centers)
-            integrator = {"type": "path", "max_depth": MOST_BOUNCES}
+            # Only this one lets the sun through glass.
+            glass = bool((arena.look.finish.surface == GLASS).any())
+            integrator = {"type": "volpath" if glass else "path", "max_depth": MOST_BOUNCES}
             bodies = _lights(mi, arena.look.light) | _bodies(mi, arena, centers)
             self._scene = mi.load_dict({"type": "scene", "integrator": integrator, **bodies})
         axes, k = quat_to_matrix(quaternion).T, intrinsics
@@ -307,7 +310,7 @@ def _cylinder(
     ends = [(center + np.array([0.0, 0.0, side * height])).tolist() for side in (-1.0, 1.0)]
     side = {"type": "cylinder", "p0": ends[0], "p1": ends[1], "radius": radius, "bsdf": bsdf}
     dark, bright = finish.albedo[row]
-    mean = _diffuse(dark + mean_of(finish, row) * (bright - dark))
+    mean = _reflecting(finish, row, _rgb(dark + mean_of(finish, row) * (bright - dark)))
     caps = []
     for end in ends:
         pose = np.diag([radius, radius, 1.0, 1.0])
@@ -377,8 +380,33 @@ def _around(finish: Finish, row: int, radius: float) -> float:
 
 
 def _diffuse(albedo: Floats) -> dict[str, Any]:
-    colour = {"type": "rgb", "value": albedo.tolist()}
-    return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": colour}}
+    return _two_sided({"type": "diffuse", "reflectance": _rgb(albedo)})
+
+
+def _rgb(albedo: Floats) -> dict[str, Any]:
+    return {"type": "rgb", "value": albedo.tolist()}
+
+
+def _two_sided(bsdf: dict[str, Any]) -> dict[str, Any]:
+    return {"type": "twosided", "bsdf": bsdf}
+
+
+def _reflecting(finish: Finish, row: int, albedo: dict[str, Any]) -> dict[str, Any]:
+    """Return a material of an albedo, which may be a texture, as `gloss` has it."""
+    surface, alpha = finish.surface[row], float(finish.roughness[row] ** 2)
+    if surface == GLASS:
+        # Its panes have two sides of their own.
+        return {"type": "thindielectric", "int_ior": INDEX, "specular_transmittance": albedo}
+    rough = {} if is_smooth(alpha) else {"distribution": "ggx", "alpha": alpha}
+    if surface == METAL:
+        kind = "roughconductor" if rough else "conductor"
+        return _two_sided(
+            {"type": kind, "material": "none", "specular_reflectance": albedo, **rough}
+        )
+    if surface == GLOSSY:
+        kind = "roughplastic" if rough else "plastic"
+        return _two_sided({"type": kind, "int_ior": INDEX, "diffuse_reflectance": albedo, **rough})
+    return _two_sided({"type": "diffuse", "reflectance": albedo})
 
 
 def _material(
@@ -391,7 +419,7 @@ def _material(
     """Return a material whose pattern begins at `start` and goes on for `size`, in periods."""
     dark, bright = finish.albedo[row]
     if TEXTURES.index("plain") == finish.texture[row]:
-        return _diffuse(dark)
+        return _reflecting(finish, row, _rgb(dark))
     mixed = (dark + texels(finish, row) * (bright - dark)).astype(np.float32)
     place = np.eye(4)
     place[0, 0], place[1, 1], place[0, 3], place[1, 3] = *size, *start
@@ -402,4 +430,4 @@ def _material(
         "filter_type": "nearest",
         "to_uv": mi.ScalarTransform4f(place),
     }
-    return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": texture}}
+    return _reflecting(finish, row, texture)

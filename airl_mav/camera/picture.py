@@ -14,6 +14,7 @@ from airl_mav.arena.geometry import Arena
 from airl_mav.camera.bvh import meshes_of
 from airl_mav.camera.colour import Work, render_colour
 from airl_mav.camera.fisheye import bent_of
+from airl_mav.camera.gloss import Gloss
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.rays import finer
 from airl_mav.camera.textures import atlas, mean_of, periods
@@ -41,6 +42,7 @@ class ColourArrays:
     per_m: NDArray[np.float32]  # (m,) [1/m]
     offset: NDArray[np.float32]  # (m, 2)
     albedo: NDArray[np.float32]  # (m, 2, 3)
+    gloss: Gloss | None
     lights: NDArray[np.float32]  # (7, 3)
 
     @classmethod
@@ -61,6 +63,7 @@ class ColourArrays:
             (1.0 / (finish.size_m * periods(finish))).astype(np.float32),
             finish.offset.astype(np.float32),
             finish.albedo.astype(np.float32),
+            Gloss.of(finish),
             np.array(lights, np.float32),
         )
 
@@ -108,6 +111,7 @@ def render_picture(
         look.per_m,
         look.offset,
         look.albedo,
+        look.gloss,
         lights,
         atlas(arena.look.finish.images),
         bent_of(k),

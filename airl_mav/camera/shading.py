@@ -134,6 +134,26 @@ def texel_at(u: np.float32, v: np.float32, texels2: np.float32) -> np.int32:
     return I32(side * (side + row) + column)
 
 
+@kernel
+def irradiance(light: Lit, channel: int, direct: np.float32, rise: np.float32) -> np.float32:
+    """Return the irradiance of a surface in one channel of linear RGB.
+
+    The sky and the ground by the shares that a tilted plane sees of them, (1 + cos tilt) / 2 and
+    (1 - cos tilt) / 2 (Liu and Jordan, The long-term average performance of flat-plate solar-energy
+    collectors, 1963).
+
+    Args:
+        light: The light.
+        channel: 0, 1 or 2.
+        direct: Cosine of the angle between normal and sun, times the share of it that arrives.
+        rise: Cosine of the tilt: of the angle between normal and zenith.
+    """
+    # What an upright plane gets of both, and how much more a level one.
+    upright = HALF * (light.sky[channel] + light.ground[channel])
+    level = light.sky[channel] - upright
+    return direct * light.sun[channel] + (upright + rise * level)
+
+
 @borrowing_kernel
 def paint(
     out: Packed,
@@ -151,9 +171,7 @@ def paint(
 ) -> None:
     """Write the packed sRGB of a part of an image where it sees a surface.
 
-    Lambert's law for the sun; the sky and the ground by the shares that a tilted plane sees of
-    them, (1 + cos tilt) / 2 and (1 - cos tilt) / 2 (Liu and Jordan, The long-term average
-    performance of flat-plate solar-energy collectors, 1963); fog by Beer-Lambert's law.
+    Lambert's law; fog by Beer-Lambert's law.
 
     Args:
         out: (n,) packed colours, written.
@@ -183,22 +201,13 @@ def paint(
         for u in range(end - left):
             green_of[u] = atlas[np.uint64(green_at + place[u])]
             blue_of[u] = atlas[np.uint64(blue_at + place[u])]
-    dark, more, sun, horizon = surface.albedo, surface.more, light.sun, light.horizon
-    # Of sky and ground: what an upright plane gets of both, and how much more a level one.
-    upright = (
-        HALF * (light.sky[0] + light.ground[0]),
-        HALF * (light.sky[1] + light.ground[1]),
-        HALF * (light.sky[2] + light.ground[2]),
-    )
-    level = (light.sky[0] - upright[0], light.sky[1] - upright[1], light.sky[2] - upright[2])
+    dark, more, horizon = surface.albedo, surface.more, light.horizon
     for u in range(end - left):
         value, through = pattern[u], clear_row[u]
         direct, rise = lit_row[u] * facing[u], up[u]
-        red = (dark[0] + more[0] * value) * (direct * sun[0] + (upright[0] + rise * level[0]))
-        green = (dark[1] + more[1] * green_of[u]) * (
-            direct * sun[1] + (upright[1] + rise * level[1])
-        )
-        blue = (dark[2] + more[2] * blue_of[u]) * (direct * sun[2] + (upright[2] + rise * level[2]))
+        red = (dark[0] + more[0] * value) * irradiance(light, 0, direct, rise)
+        green = (dark[1] + more[1] * green_of[u]) * irradiance(light, 1, direct, rise)
+        blue = (dark[2] + more[2] * blue_of[u]) * irradiance(light, 2, direct, rise)
         colour = packed(
             horizon[0] + through * (red - horizon[0]),
             horizon[1] + through * (green - horizon[1]),

@@ -62,11 +62,12 @@ def shade_by_walls(
     bounds: NDArray[np.float64],
     to_sun: Vec,
     extinction: float,
+    through: np.float32,
 ) -> None:
     """Write which points the walls leave in the sun, and how much of their light fog lets through.
 
     Args:
-        lit: (n,) written: 1 in the sun, 0 in shadow.
+        lit: (n,) written: share of the sun that arrives, 1 in the sun.
         clear: (n,) written: share of light that fog on the way to the camera lets through.
         far: (n,) depth [m]; 0: no surface.
         rays: Of the pixels.
@@ -74,6 +75,7 @@ def shade_by_walls(
         bounds: (6,) of the arena.
         to_sun: (3,) unit vector NED.
         extinction: Of fog [1/m].
+        through: Share of the sun's light that the walls let through; 0 but of glass.
     """
     north, east, up = sized(to_sun[0]), sized(to_sun[1]), F32(-to_sun[2])
     # From the camera to the walls that the sunlight comes over.
@@ -86,7 +88,7 @@ def shade_by_walls(
         n, e, d = t * rays.north[u], t * rays.east[u], t * rays.down[u]
         run = min((edge_n - n) * per_n, (edge_e - e) * per_e)
         over = above - d + run * up
-        lit[u] = ZERO if (run > _STEP_M and over < height) else ONE
+        lit[u] = through if (run > _STEP_M and over < height) else ONE
         clear[u] = ONE
     if extinction > 0.0:
         for u in range(len(far)):
@@ -141,11 +143,12 @@ def shade_by_obstacle(
     half: Vec,
     yaw: float,
     to_sun: Vec,
+    through: np.float32,
 ) -> None:
     """Put the points that an obstacle hides from the sun into shadow.
 
     Args:
-        lit: (n, m) changed: 0 in shadow.
+        lit: (n, m) changed: times `through` in shadow.
         far: (n, m) depth [m].
         ids: (n, m) what is seen.
         corners: (CORNERS, 3) room to work in.
@@ -160,6 +163,7 @@ def shade_by_obstacle(
         half: Half extents [m].
         yaw: Heading of a box's first axis [rad].
         to_sun: (3,) unit vector NED.
+        through: Share of the sun's light that passes through it; 0 but of glass.
     """
     level = math.sqrt(to_sun[0] * to_sun[0] + to_sun[1] * to_sun[1])
     cos, sin = 1.0, 0.0
@@ -199,7 +203,7 @@ def shade_by_obstacle(
                 enter = max(max(a - w0, b - w1), d - w2)
                 leave = min(min(a + w0, b + w1), d + w2)
                 hidden = (leave >= max(enter, ZERO)) & (ids_row[u] != own)
-                lit_row[u] = ZERO if hidden else lit_row[u]
+                lit_row[u] = through * lit_row[u] if hidden else lit_row[u]
         elif shape == CYLINDER:
             for u in range(end - left):
                 t = far_row[u]
@@ -212,9 +216,9 @@ def shade_by_obstacle(
                 chord = np.sqrt(max(rest, ZERO))
                 enter = max((a - chord) * per_level, d - w2)
                 leave = min((a + chord) * per_level, d + w2)
-                through = (leave >= max(enter, ZERO)) & (rest > ZERO)
-                hidden = through & (ids_row[u] != own)
-                lit_row[u] = ZERO if hidden else lit_row[u]
+                stopped = (leave >= max(enter, ZERO)) & (rest > ZERO)
+                hidden = stopped & (ids_row[u] != own)
+                lit_row[u] = through * lit_row[u] if hidden else lit_row[u]
         else:
             for u in range(end - left):
                 t = far_row[u]
@@ -225,7 +229,7 @@ def shade_by_obstacle(
                 toward = a * s0 + b * s1 + d * s2
                 apart = a * a + b * b + d * d - toward * toward
                 hidden = (apart < square) & (toward > ZERO) & (ids_row[u] != own)
-                lit_row[u] = ZERO if hidden else lit_row[u]
+                lit_row[u] = through * lit_row[u] if hidden else lit_row[u]
 
 
 @borrowing_kernel

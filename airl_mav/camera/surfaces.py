@@ -12,6 +12,14 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.camera.patterns import (
+    STEEP,
+    on_box,
+    on_cylinder,
+    on_sphere,
+    periods_around,
+    texels2,
+)
 from airl_mav.camera.primitives import (
     BOX,
     CEILING,
@@ -42,11 +50,9 @@ from airl_mav.camera.shading import (
     packed,
     paint,
     texel_at,
-    turn_of,
 )
 from airl_mav.camera.shadows import along32, ray32, start32, widened
-from airl_mav.camera.textures import SIDE
-from airl_mav.core.kernels import borrowing_kernel, kernel
+from airl_mav.core.kernels import borrowing_kernel
 from airl_mav.vehicle.rotation import Vec
 
 BLOCK: Final = 512
@@ -54,11 +60,6 @@ BLOCK: Final = 512
 
 FOG_LAYER_M: Final = 100.0
 """Height of the fog above the floor, seen towards the sky [m]."""
-
-_TURN: Final = 2.0 * math.pi
-
-STEEP: Final = F32(0.02)
-"""Least cosine between ray and normal for the size of a pixel."""
 
 
 @borrowing_kernel
@@ -134,13 +135,6 @@ def draw_sky(out: Packed, ids: Ids, points: Points, rays: Rays, camera: Vec, lig
             green = green if rise >= ZERO else through * (ground[1] - horizon[1])
             blue = blue if rise >= ZERO else through * (ground[2] - horizon[2])
             row[u] = packed(horizon[0] + red, horizon[1] + green, horizon[2] + blue)
-
-
-@kernel
-def texels2(surface: Surface, pixel2: np.float32) -> np.float32:
-    """Return the square of the texels of the finest level that a pixel covers 1 m away, head on."""
-    texels = F32(SIDE) * surface.per_m
-    return texels * texels * pixel2
 
 
 @borrowing_kernel
@@ -254,7 +248,7 @@ def shade_obstacle(
     per0, per1, per2 = F32(1.0 / half[0]), F32(1.0 / half[1]), F32(1.0 / half[2])
     texel, radius = texels2(surface, pixel2), F32(half[0])
     per_m, begin_u, begin_v = surface.per_m, surface.offset[0], surface.offset[1]
-    per_turn = F32(max(np.rint(_TURN * half[0] * per_m), 1.0))
+    per_turn = periods_around(half[0], per_m)
     place, facing, ups = points.place, points.facing, points.up
     own = I32(OBSTACLE + number)
     for v in range(rectangle[0], rectangle[1]):
@@ -278,8 +272,7 @@ def shade_obstacle(
                 to_sun = s2 if on_c else (s0 if on_a else s1)
                 to_sun = to_sun if outward > ZERO else -to_sun
                 up = ONE if c < ZERO else -ONE
-                across = a if on_c else (b if on_a else a)
-                along = b if on_c else c
+                across, along = on_box(a, b, c, on_c, on_a)
                 texels = texel * t * t / max(abs(normal), STEEP)
                 place[u] = texel_at(across * per_m + begin_u, along * per_m + begin_v, texels)
                 facing[u] = max(to_sun, ZERO)
@@ -294,8 +287,7 @@ def shade_obstacle(
                 vertical = s2 if c > ZERO else -s2
                 to_sun = vertical if cap else (a * s0 + b * s1) * per0
                 up = ONE if c < ZERO else -ONE
-                across = a * per_m if cap else turn_of(b, a) * per_turn
-                along = (b if cap else c) * per_m
+                across, along = on_cylinder(a, b, c, cap, per_m, per_turn)
                 texels = texel * t * t / max(abs(normal), STEEP)
                 place[u] = texel_at(across + begin_u, along + begin_v, texels)
                 facing[u] = max(to_sun, ZERO)
@@ -307,8 +299,7 @@ def shade_obstacle(
                 a, b, c = t * n - c0, t * e - c1, t * d - c2
                 normal = (a * n + b * e + c * d) * per0
                 to_sun = (a * s0 + b * s1 + c * s2) * per0
-                across = turn_of(b, a) * per_turn
-                along = turn_of(c, np.sqrt(a * a + b * b)) * per_turn
+                across, along = on_sphere(a, b, c, per_turn)
                 texels = texel * t * t / max(abs(normal), STEEP)
                 place[u] = texel_at(across + begin_u, along + begin_v, texels)
                 facing[u] = max(to_sun, ZERO)

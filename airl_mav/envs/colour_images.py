@@ -12,6 +12,7 @@ from airl_mav.arena.appearance import OBSTACLE
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.colour import Work, render_colour
 from airl_mav.camera.fisheye import bent_of
+from airl_mav.camera.gloss import MATT, Gloss
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.picture import ColourArrays, write_grey
 from airl_mav.camera.projection import Bent
@@ -35,6 +36,21 @@ class LookBatch(NamedTuple):
     lights: NDArray[np.float32]  # (n, 7, 3)
 
 
+class GlossBatch(NamedTuple):
+    """What the surfaces of n arenas are beside matt, padded; see `camera.gloss.Gloss`."""
+
+    surface: NDArray[np.int8]  # (n, m)
+    alpha: NDArray[np.float32]  # (n, m)
+    lets: NDArray[np.float32]  # (n, m)
+
+
+def _all_matt(n: int, surfaces: int) -> GlossBatch:
+    shape = (n, surfaces)
+    return GlossBatch(
+        np.full(shape, MATT, np.int8), np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    )
+
+
 def _empty(n: int, surfaces: int) -> LookBatch:
     return LookBatch(
         np.zeros((n, surfaces), np.int8),
@@ -54,6 +70,8 @@ class Looks:
         """Those that it knows the looks of, by slot."""
         self.batch = _empty(n, OBSTACLE)
         """What the kernel looks at; replaced where an arena has more surfaces than all before."""
+        self.gloss: GlossBatch | None = None
+        """As `batch`; None: all surfaces have been matt, and nothing is spent on others."""
         self.images: tuple[ImageFile, ...] = ()
         """Textures from files, of all arenas."""
 
@@ -76,10 +94,22 @@ class Looks:
             larger = _empty(len(self.batch.texture), count)
             copy_rows(self.batch, larger)
             self.batch = larger
+            if self.gloss is not None:
+                roomy = _all_matt(len(self.batch.texture), count)
+                copy_rows(self.gloss, roomy)
+                self.gloss = roomy
         batch = self.batch
         batch.lights[i] = look.lights
         for name in ("texture", "per_m", "offset", "albedo"):
             getattr(batch, name)[i, :count] = getattr(look, name)
+        if self.gloss is None and look.gloss is not None:
+            self.gloss = _all_matt(*batch.texture.shape)
+        if self.gloss is not None:
+            self.gloss.surface[i] = MATT
+            self.gloss.lets[i] = 0.0
+        if self.gloss is not None and look.gloss is not None:
+            for name, rows in look.gloss._asdict().items():
+                getattr(self.gloss, name)[i, :count] = rows
 
     def restore(self, arenas: Sequence[Arena | None]) -> None:
         """Take the looks of all slots again; None: no episode has begun there."""
@@ -112,6 +142,7 @@ class ColourImages:
             fleet,
             arenas,
             self._looks.batch,
+            self._looks.gloss,
             self._meshes.batch,
             who,
             self._mount,
@@ -124,10 +155,17 @@ class ColourImages:
 
 
 @kernel
+def _gloss_in(gloss: GlossBatch, i: int, surfaces: int) -> Gloss:
+    """Return what the surfaces of arena i are."""
+    return Gloss(gloss.surface[i, :surfaces], gloss.alpha[i, :surfaces], gloss.lets[i, :surfaces])
+
+
+@kernel
 def render_colour_images(
     fleet: Fleet,
     arenas: ArenaBatch,
     looks: LookBatch,
+    gloss: GlossBatch | None,
     meshes: MeshBatch | None,
     who: NDArray[np.bool_],
     mount: Mount,
@@ -149,6 +187,7 @@ def render_colour_images(
         fleet: Poses and times.
         arenas: One a vehicle; moving obstacles are put where they are at its time.
         looks: One an arena.
+        gloss: With `looks`; None: all surfaces are matt.
         meshes: Those of the arenas; None: there are none.
         who: (n,) whose image is rendered; the others' stays as it is.
         mount: The camera's place on the body.
@@ -194,6 +233,7 @@ def render_colour_images(
             looks.per_m[i, :surfaces],
             looks.offset[i, :surfaces],
             looks.albedo[i, :surfaces],
+            None if gloss is None else _gloss_in(gloss, i, surfaces),
             looks.lights[i],
             patterns,
             bent,

@@ -1,4 +1,4 @@
-"""What an arena looks like to a colour camera: materials, textures, sun, sky and fog.
+"""What an arena looks like to a colour camera: materials, textures, sun, sky, fog, rain.
 
 Every pair of numbers is [least, greatest], drawn uniformly for each seed. Colours are sRGB, 0-255.
 """
@@ -13,6 +13,7 @@ from airl_mav.core.fields import Each, ProfileModel, later_field, quantity
 from airl_mav.profiles.image_file import MOST_IMAGES, ImageFile
 
 TextureName = Literal["plain", "checker", "noise", "brick", "foliage"]
+SurfaceName = Literal["matt", "glossy", "metal", "glass"]
 Colour = Annotated[tuple[int, int, int], Each(0, 255)]
 Materials = Annotated[tuple[str, ...], Field(min_length=1)]
 
@@ -21,7 +22,7 @@ WALL_COLOUR = "wall_colour"
 
 
 class Material(ProfileModel):
-    """A matt (Lambertian) material: two albedos, and the texture that mixes them; or an image."""
+    """A material: two albedos, the texture that mixes them or an image, and how it reflects."""
 
     albedo: Colour = quantity(
         "reflectance, as an sRGB colour, where the pattern is 0: mortar, shade between leaves; with"
@@ -47,6 +48,17 @@ class Material(ProfileModel):
         default=0.5,
     )
     image: ImageFile | None = later_field(None, "a picture of your own in place of a pattern")
+    surface: SurfaceName = later_field(
+        "matt",
+        "matt (Lambert's law); glossy: matt under clear varnish; metal, whose albedo is the"
+        " reflectance of its facets: a mirror where it is smooth; glass: thin panes around nothing,"
+        " whose albedo is what each lets through beside what it reflects",
+    )
+    roughness: Annotated[float, Field(ge=0, le=1)] = later_field(
+        0.0,
+        "of a glossy surface and of metal: root of the width of the slopes of its facets (GGX); 0:"
+        " as smooth as a mirror",
+    )
 
     @model_validator(mode="after")
     def _image_or_pattern(self) -> Material:
@@ -54,6 +66,10 @@ class Material(ProfileModel):
             raise ValueError(f"texture = {self.texture!r}: accepted: none with an image")
         if self.image is not None and self.albedo_2 is not None:
             raise ValueError(f"albedo_2 = {list(self.albedo_2)}: accepted: none with an image")
+        if self.roughness and self.surface not in ("glossy", "metal"):
+            raise ValueError(
+                f"roughness = {self.roughness:g}: accepted: 0 with surface = {self.surface!r}"
+            )
         return self
 
 
@@ -75,6 +91,18 @@ MATERIALS: dict[str, Material] = {
     "bark": Material(albedo=(52, 40, 30), albedo_2=(116, 94, 72), texture="noise", size_m=0.2),
     "wood": Material(albedo=(120, 84, 48), albedo_2=(168, 126, 80), texture="noise", size_m=0.3),
     "steel": Material(albedo=(112, 116, 120)),
+    "mirror": Material(albedo=(242, 242, 240), surface="metal"),
+    "brushed-steel": Material(albedo=(196, 196, 198), surface="metal", roughness=0.45),
+    "lacquer": Material(albedo=(168, 28, 26), surface="glossy", roughness=0.15),
+    "wet-asphalt": Material(
+        albedo=(38, 38, 40),
+        albedo_2=(74, 74, 76),
+        texture="noise",
+        size_m=0.5,
+        surface="glossy",
+        roughness=0.3,
+    ),
+    "glass": Material(albedo=(250, 253, 250), surface="glass"),
 }
 """Materials that every arena can name."""
 

@@ -180,6 +180,40 @@ def test_meshes_are_theirs(material: str, tmp_path: Path) -> None:
     assert float(np.abs(ours.astype(float) - theirs)[shown].mean()) / 255.0 > 0.1
 
 
+SHINY: dict[str, dict[str, Any]] = {
+    "mirror": {"albedo": [242, 242, 240], "surface": "metal"},
+    "metal": {"albedo": [200, 200, 190], "surface": "metal", "roughness": 0.6},
+    "varnish": {"albedo": [15, 15, 18], "surface": "glossy"},
+    "lacquer": {"albedo": [30, 5, 5], "surface": "glossy", "roughness": 0.15},
+    "glass": {"albedo": [250, 253, 250], "surface": "glass"},
+}
+
+
+@pytest.mark.parametrize("surface", list(SHINY))
+def test_what_is_mirrored_and_seen_through_glass_is_theirs(surface: str) -> None:
+    """Every obstacle of one material; a matt one of its colour is farther off."""
+    look = {"sun": LIGHT["sun"], "materials": {"own": SHINY[surface]},
+            "walls": {"materials": ["plaster"]}, "floor": {"materials": ["concrete"]},
+            "static": {"materials": ["own"], "brightness": [1, 1], "tint": 0}}  # fmt: skip
+    scene = arena("dense-obstacles", 3, **look)
+    place, attitude = np.array([0.0, 0.0, -2.5]), quat_from_euler(0.03, -0.08, 0.0)
+    centers = scene.centers_at(0)
+    theirs = path_traced(scene, centers, CAMERA, place, attitude, samples=64)
+    ours = antialiased(scene, centers, CAMERA, place, attitude, 4)
+    picture = render_picture(scene, centers, CAMERA, place, attitude)
+    shown = (picture.seen >= 4) & ~edges(picture.seen)
+    assert shown.sum() > 500
+    apart = float(np.abs(ours.astype(float) - theirs)[shown].mean()) / 255.0
+    assert apart < 0.03
+    plain = {**SHINY[surface]}
+    plain.pop("surface")
+    plain.pop("roughness", None)
+    scene = arena("dense-obstacles", 3, **{**look, "materials": {"own": plain}})
+    matt = antialiased(scene, centers, CAMERA, place, attitude, 4)
+    off = float(np.abs(matt.astype(float) - theirs)[shown].mean()) / 255.0
+    assert off > 1.5 * apart, (off, apart)
+
+
 BENT = [
     Intrinsics.from_fov(72, 54, math.radians(170.0), "fisheye"),
     Intrinsics.from_fov(72, 60, math.radians(190.0), "fisheye", distortion=BARREL),

@@ -425,8 +425,9 @@ def digest(name: str) -> str:
             told.update(np.ascontiguousarray(array).tobytes())
         for tour in arena.tours:
             told.update(tour.points.tobytes())
-        look = arena.look
-        for array in (*vars(look.finish).values(), look.light.sun, look.light.zenith):
+        look, f = arena.look, arena.look.finish
+        drawn = (f.texture, f.albedo, f.size_m, f.offset, f.images)
+        for array in (*drawn, look.light.sun, look.light.zenith):
             told.update(np.ascontiguousarray(array).tobytes())
     return told.hexdigest()[:16]
 

@@ -1,0 +1,185 @@
+"""How surfaces reflect beside Lambert's law: Fresnel's equations and microfacets.
+
+Rough surfaces are those of Walter et al., Microfacet models for refraction through rough surfaces,
+2007: facets whose slopes have the distribution GGX, which shadow each other as Smith has it, in
+both directions apart. The directions that they mirror are sampled by the facets that are seen
+(Heitz, Sampling the GGX distribution of visible normals, 2018).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.arena.appearance import LUMINANCE, SURFACES, WALLS, Finish
+from airl_mav.camera.projection import dot
+from airl_mav.core.kernels import borrowing_kernel, kernel
+from airl_mav.vehicle.rotation import Vec
+
+MATT: Final = SURFACES.index("matt")
+GLOSSY: Final = SURFACES.index("glossy")
+METAL: Final = SURFACES.index("metal")
+GLASS: Final = SURFACES.index("glass")
+
+INDEX: Final = 1.5
+"""Refractive index of varnish and of glass."""
+
+_SMOOTH: Final = 1e-3
+"""A surface whose `alpha` is less than this is a mirror."""
+
+VARNISH_ADMITS: Final = 0.908222
+"""Share of light from all sides that enters varnish: 1 - 0.091778, the mean of Fresnel's
+reflectance at the index 1.5 over the cosine."""
+
+SAMPLES: Final = 8
+"""Directions that a rough surface mirrors, at each of its points; `spread` has eight."""
+
+
+class Gloss(NamedTuple):
+    """What surfaces are, beside matt; a tuple, so that kernels take it. Rows as of `Finish`."""
+
+    surface: NDArray[np.int8]  # (m,) MATT, GLOSSY, ...
+    alpha: NDArray[np.float32]  # (m,) width of the slopes of the facets; 0: a mirror
+    lets: NDArray[np.float32]  # (m,) share of the sun's light that passes through a body
+
+    @classmethod
+    def of(cls, finish: Finish) -> Gloss | None:
+        """Return what the surfaces of an arena are; None: all are matt."""
+        if not finish.surface.any():
+            return None
+        mean = finish.albedo.mean(axis=1) @ LUMINANCE
+        sheet = (1.0 - pane_reflects(1.0)) * mean
+        # Through a body both of its sides; a wall is one sheet.
+        lets = np.where(finish.surface == GLASS, sheet**2, 0.0)
+        lets[WALLS] = sheet[WALLS] if finish.surface[WALLS] == GLASS else 0.0
+        alpha = finish.roughness**2
+        return cls(finish.surface, alpha.astype(np.float32), lets.astype(np.float32))
+
+
+@borrowing_kernel
+def let_through(gloss: Gloss | None, row: int) -> np.float32:
+    """Return the share of the sun's light that passes through a body; 0 where all is matt."""
+    return np.float32(0.0) if gloss is None else gloss.lets[row]
+
+
+@kernel
+def fresnel(cosine: float) -> float:
+    """Return the share of unpolarised light that is reflected where it enters varnish or glass.
+
+    `cosine`: of the angle between ray and normal, 0 to 1.
+    """
+    inner = math.sqrt(1.0 - (1.0 - cosine * cosine) / (INDEX * INDEX))
+    across = (cosine - INDEX * inner) / (cosine + INDEX * inner)
+    along = (INDEX * cosine - inner) / (INDEX * cosine + inner)
+    return 0.5 * (across * across + along * along)
+
+
+@kernel
+def pane_reflects(cosine: float) -> float:
+    """Return the share that a thin pane reflects: both of its sides, to and fro between them."""
+    once = fresnel(cosine)
+    return 2.0 * once / (1.0 + once)
+
+
+@kernel
+def is_smooth(alpha: float) -> bool:
+    """Return whether a surface is a mirror."""
+    return alpha < _SMOOTH
+
+
+@kernel
+def _visible(alpha: float, cosine: float) -> float:
+    """Return the share of facets that is seen from a side (Smith's G1 for GGX)."""
+    tangent2 = 1.0 / max(cosine * cosine, 1e-12) - 1.0
+    return 2.0 / (1.0 + math.sqrt(1.0 + alpha * alpha * tangent2))
+
+
+@kernel
+def highlight(alpha: float, normal: Vec, ray: Vec, to_sun: Vec) -> tuple[float, float]:
+    """Return what a rough surface reflects of the sun, for a white facet.
+
+    Args:
+        alpha: Width of the slopes.
+        normal: (3,) unit vector on the side that is seen.
+        ray: (3,) unit vector of the ray that meets it.
+        to_sun: (3,) unit vector.
+
+    Returns:
+        Radiance over irradiance, both in the units of `Lit`; and the cosine at the facets, by which
+        Fresnel's share of it is known.
+    """
+    sun, eye = dot(normal, to_sun), -dot(normal, ray)
+    if sun <= 0.0 or eye <= 0.0:
+        return 0.0, 1.0
+    h = (to_sun[0] - ray[0], to_sun[1] - ray[1], to_sun[2] - ray[2])
+    per = 1.0 / max(math.sqrt(dot(h, h)), 1e-12)
+    half = per * dot(normal, h)
+    spread = half * half * (alpha * alpha - 1.0) + 1.0
+    # The distribution is this over pi, and a white matt surface has pi times less: they cancel.
+    facets = alpha * alpha / (spread * spread)
+    value = facets * _visible(alpha, sun) * _visible(alpha, eye) / (4.0 * eye)
+    return value, -per * dot(h, ray)
+
+
+@kernel
+def mirrored(ray: Vec, normal: Vec) -> Vec:
+    """Return the direction that a ray is mirrored to, a unit vector however often it is."""
+    twice = 2.0 * dot(ray, normal)
+    a, b, c = (
+        ray[0] - twice * normal[0],
+        ray[1] - twice * normal[1],
+        ray[2] - twice * normal[2],
+    )
+    per = 1.0 / math.sqrt(a * a + b * b + c * c)
+    return (per * a, per * b, per * c)
+
+
+@kernel
+def spread(number: int) -> tuple[float, float]:
+    """Return one of `SAMPLES` points that lie evenly in the unit square (Hammersley's)."""
+    mirrored_bits = 4 * (number & 1) + (number & 2) + ((number & 4) >> 2)
+    return (number + 0.5) / SAMPLES, (mirrored_bits + 0.5) / SAMPLES
+
+
+@kernel
+def facet(alpha: float, normal: Vec, ray: Vec, u: float, v: float) -> Vec:
+    """Return the normal of one of the facets that are seen at a point.
+
+    As many are seen in each direction as (u, v) lie evenly in the unit square.
+    """
+    # Axes about the normal (Duff et al., Building an orthonormal basis, revisited, 2017).
+    sign = math.copysign(1.0, normal[2])
+    a = -1.0 / (sign + normal[2])
+    b = normal[0] * normal[1] * a
+    first = (1.0 + sign * normal[0] * normal[0] * a, sign * b, -sign * normal[0])
+    second = (b, sign + normal[1] * normal[1] * a, -normal[1])
+    x, y, z = -alpha * dot(first, ray), -alpha * dot(second, ray), -dot(normal, ray)
+    per = 1.0 / math.sqrt(x * x + y * y + z * z)
+    x, y, z = per * x, per * y, per * z
+    level = math.sqrt(x * x + y * y)
+    p0, p1 = (-y / level, x / level) if level > 1e-9 else (1.0, 0.0)
+    # Third axis: (x, y, z) times (p0, p1, 0).
+    q0, q1, q2 = -z * p1, z * p0, x * p1 - y * p0
+    radius, angle = math.sqrt(u), 2.0 * math.pi * v
+    s, t = radius * math.cos(angle), radius * math.sin(angle)
+    share = 0.5 * (1.0 + z)
+    t = (1.0 - share) * math.sqrt(max(1.0 - s * s, 0.0)) + share * t
+    w = math.sqrt(max(1.0 - s * s - t * t, 0.0))
+    m0, m1, m2 = s * p0 + t * q0 + w * x, s * p1 + t * q1 + w * y, t * q2 + w * z
+    m0, m1, m2 = alpha * m0, alpha * m1, max(m2, 0.0)
+    per = 1.0 / max(math.sqrt(m0 * m0 + m1 * m1 + m2 * m2), 1e-12)
+    return (
+        per * (m0 * first[0] + m1 * second[0] + m2 * normal[0]),
+        per * (m0 * first[1] + m1 * second[1] + m2 * normal[1]),
+        per * (m0 * first[2] + m1 * second[2] + m2 * normal[2]),
+    )
+
+
+@kernel
+def facet_gives(alpha: float, normal: Vec, away: Vec) -> float:
+    """Return what a direction `away`, mirrored by a sampled facet, counts: 0 below the surface."""
+    cosine = dot(normal, away)
+    return _visible(alpha, cosine) if cosine > 0.0 else 0.0

@@ -1,0 +1,430 @@
+"""What is seen in and through surfaces that are not matt, ray by ray.
+
+Where an image sees varnish, metal or glass, its pixel is drawn once more: from the camera's ray a
+tree of rays grows, mirrored by varnish, metal and glass, straight on through glass, until all that
+they meet is matt, or counts for nothing. A rough surface that the camera itself sees mirrors
+`gloss.SAMPLES` directions; those seen in others are as if smooth, but for the sun, whose highlight
+has a closed form. What is matt looks as in `shading.paint`, with a shadow ray to the sun.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.arena.appearance import FLOOR as FLOOR_ROW
+from airl_mav.arena.appearance import OBSTACLE as OBSTACLE_ROW
+from airl_mav.arena.appearance import WALLS as WALLS_ROW
+from airl_mav.camera.bvh import STACK, Meshes
+from airl_mav.camera.gloss import (
+    GLASS,
+    GLOSSY,
+    MATT,
+    METAL,
+    SAMPLES,
+    VARNISH_ADMITS,
+    Gloss,
+    facet,
+    facet_gives,
+    fresnel,
+    highlight,
+    is_smooth,
+    mirrored,
+    pane_reflects,
+    spread,
+)
+from airl_mav.camera.patterns import (
+    STEEP,
+    on_box,
+    on_cylinder,
+    on_sphere,
+    on_triangle,
+    periods_around,
+    texels2,
+)
+from airl_mav.camera.primitives import (
+    BOX,
+    CEILING,
+    CYLINDER,
+    FLOOR,
+    GROUND,
+    OBSTACLE,
+    SKY,
+    WALL_NORTH_SOUTH,
+    Ids,
+)
+from airl_mav.camera.projection import dot
+from airl_mav.camera.scene_rays import (
+    Bodies,
+    Met,
+    Place,
+    advanced,
+    bodies_of,
+    meet,
+    place_of,
+    sunlight,
+)
+from airl_mav.camera.shading import (
+    F32,
+    ZERO,
+    Lit,
+    Packed,
+    Plane,
+    Rays,
+    Vec32,
+    irradiance,
+    packed,
+    surface_of,
+    texel_at,
+)
+from airl_mav.camera.surfaces import FOG_LAYER_M
+from airl_mav.core.kernels import borrowing_kernel, kernel, large_borrowing_kernel, large_kernel
+from airl_mav.vehicle.rotation import Vec
+
+MOST_RAYS: Final = 64
+"""Rays of one pixel."""
+
+_COUNTS: Final = 1.0 / 256.0
+"""A ray of which less than this share is seen is not followed."""
+
+_WAITING: Final = 48
+"""Rays of one pixel that wait, at most: `SAMPLES`, and one more for each that is followed."""
+
+_ABOVE_M: Final = 5e-4
+"""So far above a mesh begins a ray to the sun [m], as of `mesh_shadows`."""
+
+_RAY: Final = 11
+"""Numbers of a ray that waits: origin, direction, share of red, green and blue, way so far, depth
+in the tree."""
+
+
+@kernel
+def row_of(seen: int) -> int:
+    """Return the row of `Finish` of what is seen: neither ceiling nor sky."""
+    if seen >= OBSTACLE:
+        return OBSTACLE_ROW + seen - OBSTACLE
+    return FLOOR_ROW if seen in (FLOOR, GROUND) else WALLS_ROW
+
+
+class Look(NamedTuple):
+    """How an arena looks, as `colour.render_colour` takes it; and how wide pixels are."""
+
+    texture: NDArray[np.int8]  # (2 + n,)
+    per_m: NDArray[np.float32]  # (2 + n,)
+    offset: NDArray[np.float32]  # (2 + n, 2)
+    albedo: NDArray[np.float32]  # (2 + n, 2, 3)
+    gloss: Gloss
+    light: Lit
+    atlas: Plane
+    pixel2: np.float32
+    """Square of the side of a pixel at a depth of 1."""
+
+
+class Seen(NamedTuple):
+    """A point that a ray meets, and how much of the light from there is seen."""
+
+    ray: Vec
+    share: Vec
+    """Of red, green and blue."""
+    way: float
+    """From the camera [m]."""
+    depth: int
+    """In the tree: the camera's ray has 0."""
+    at: Vec
+    """NED [m]."""
+    normal: Vec
+    """Unit vector NED on the side that is seen."""
+    albedo: Vec
+    cosine: float
+    """Of the angle between ray and normal, 0 to 1."""
+    alpha: float
+
+
+@large_kernel
+def draw_reflections(
+    out: Packed,
+    ids: Ids,
+    rays: Rays,
+    camera: Vec,
+    bounds: NDArray[np.float64],
+    shape: NDArray[np.int8],
+    center: NDArray[np.float64],
+    half_size: NDArray[np.float64],
+    yaw: NDArray[np.float64],
+    meshes: Meshes | None,
+    look: Look,
+) -> None:
+    """Draw the pixels again that see a surface which is not matt.
+
+    Args:
+        out: (n,) packed colours, changed.
+        ids: (n,) what is seen.
+        rays: Of the pixels.
+        camera: (3,) NED [m].
+        bounds: As of `render_depth`, with the rest up to `meshes`.
+        shape: (n,).
+        center: (n, 3).
+        half_size: (n, 3).
+        yaw: (n,).
+        meshes: Those that are seen; None: there are none.
+        look: How all of that looks.
+    """
+    tree, nodes = np.empty((_WAITING, _RAY)), np.empty(STACK, np.int32)
+    colour, bodies = np.empty(3), bodies_of(bounds, shape, center, half_size, yaw)
+    for u in range(len(out)):
+        seen = ids[u]
+        if seen in (SKY, CEILING) or look.gloss.surface[row_of(seen)] == MATT:
+            continue
+        n, e, d = float(rays.north[u]), float(rays.east[u]), float(rays.down[u])
+        per = 1.0 / math.sqrt(n * n + e * e + d * d)
+        # By ways along oblique rays, where `Look.pixel2` is by depth.
+        pixel2 = F32(look.pixel2 * per * per * per)
+        _wait(tree, 0, camera, (per * n, per * e, per * d), (1.0, 1.0, 1.0), 0.0, 0)
+        _follow(colour, tree, nodes, bodies, meshes, look, pixel2)
+        out[u] = packed(F32(colour[0]), F32(colour[1]), F32(colour[2]))
+
+
+@borrowing_kernel
+def _wait(
+    tree: NDArray[np.float64],
+    at: int,
+    origin: Vec,
+    ray: Vec,
+    share: Vec,
+    way: float,
+    depth: int,
+) -> None:
+    """Note a ray that is to be followed."""
+    for k in range(3):
+        tree[at, k], tree[at, 3 + k], tree[at, 6 + k] = origin[k], ray[k], share[k]
+    tree[at, 9], tree[at, 10] = way, depth
+
+
+@borrowing_kernel
+def _grown(tree: NDArray[np.float64], tops: int, seen: Seen, ray: Vec, share: Vec) -> int:
+    """Note a ray from a point that counts for something; return how many wait."""
+    if max(max(share[0], share[1]), share[2]) < _COUNTS or tops == _WAITING:
+        return tops
+    _wait(tree, tops, seen.at, ray, share, seen.way, seen.depth + 1)
+    return tops + 1
+
+
+@kernel
+def _times(a: Vec, b: Vec) -> Vec:
+    return (a[0] * b[0], a[1] * b[1], a[2] * b[2])
+
+
+@kernel
+def _scaled(a: Vec, by: float) -> Vec:
+    return (by * a[0], by * a[1], by * a[2])
+
+
+@borrowing_kernel
+def _add(colour: NDArray[np.float64], share: Vec, light: Vec | Vec32, by: float) -> None:
+    """Add a share of light, times a factor, to a colour (3,)."""
+    for k in range(3):
+        colour[k] += by * share[k] * light[k]
+
+
+@large_borrowing_kernel
+def _follow(
+    colour: NDArray[np.float64],
+    tree: NDArray[np.float64],
+    nodes: NDArray[np.int32],
+    bodies: Bodies,
+    meshes: Meshes | None,
+    look: Look,
+    pixel2: np.float32,
+) -> None:
+    """Write the linear RGB (3,) that the first ray of a tree brings; `nodes` (STACK,) is room."""
+    colour[:] = 0.0
+    tops, followed, light = 1, 0, look.light
+    while tops > 0 and followed < MOST_RAYS:
+        tops -= 1
+        followed += 1
+        origin = (tree[tops, 0], tree[tops, 1], tree[tops, 2])
+        ray = (tree[tops, 3], tree[tops, 4], tree[tops, 5])
+        share = (tree[tops, 6], tree[tops, 7], tree[tops, 8])
+        way, depth = tree[tops, 9], int(tree[tops, 10])
+        met = meet(bodies, meshes, origin, ray, nodes)
+        if met.seen == SKY:
+            _add(colour, share, _sky(light, ray, origin[2]), 1.0)
+            continue
+        if light.extinction > ZERO:
+            clear = math.exp(-float(light.extinction) * met.distance)
+            _add(colour, share, light.horizon, 1.0 - clear)
+            share = _scaled(share, clear)
+        if met.seen == CEILING:
+            _add(colour, share, light.zenith, 1.0)
+            continue
+        row = row_of(met.seen)
+        kind = look.gloss.surface[row]
+        place = place_of(bodies, meshes, met, origin, ray)
+        way += met.distance
+        albedo = _albedo(look, row, bodies, met, place, meshes, ray, way, pixel2)
+        seen = Seen(
+            ray, share, way, depth, advanced(origin, ray, met.distance), place.normal, albedo,
+            min(max(-dot(place.normal, ray), 0.0), 1.0), float(look.gloss.alpha[row]),
+        )  # fmt: skip
+        if kind == GLASS:
+            tops = _pass(tree, tops, seen)
+            continue
+        arrives = 0.0
+        if _shines(light) and dot(seen.normal, _sun(light)) > 0.0:
+            begin = advanced(seen.at, seen.normal, _ABOVE_M) if met.mesh >= 0 else seen.at
+            arrives = sunlight(bodies, meshes, look.gloss.lets, met.seen, begin, _sun(light), nodes)
+        if kind != METAL:
+            _scatter(colour, seen, kind, light, arrives)
+        if kind != MATT:
+            _shine(colour, seen, kind, light, arrives)
+            tops = _mirror(tree, tops, seen, kind)
+
+
+@kernel
+def _sun(light: Lit) -> Vec:
+    """Return the unit vector towards the sun."""
+    return (float(light.to_sun[0]), float(light.to_sun[1]), float(light.to_sun[2]))
+
+
+@kernel
+def _shines(light: Lit) -> bool:
+    """Return whether the sun does."""
+    return bool(max(max(light.sun[0], light.sun[1]), light.sun[2]) > ZERO)
+
+
+@large_borrowing_kernel
+def _pass(tree: NDArray[np.float64], tops: int, seen: Seen) -> int:
+    """Go on through a pane and back from it; return how many rays wait."""
+    back = pane_reflects(seen.cosine)
+    away = mirrored(seen.ray, seen.normal)
+    tops = _grown(tree, tops, seen, away, _scaled(seen.share, back))
+    onwards = _times(_scaled(seen.share, 1.0 - back), seen.albedo)
+    return _grown(tree, tops, seen, seen.ray, onwards)
+
+
+@large_borrowing_kernel
+def _scatter(
+    colour: NDArray[np.float64], seen: Seen, kind: int, light: Lit, arrives: float
+) -> None:
+    """Add what a matt surface scatters, bare or below varnish.
+
+    `arrives`: share of the sun's light.
+    """
+    facing, enters, sun_enters = max(dot(seen.normal, _sun(light)), 0.0), 1.0, 1.0
+    if kind == GLOSSY:
+        # Light from all sides that the varnish lets in, is scattered below it, thrown back by the
+        # varnish, scattered again, is in the end as bright as without any; so the sun's is set
+        # against the mean of all sides, and what comes out to the eye is what enters from there.
+        enters = 1.0 - fresnel(seen.cosine)
+        sun_enters = (1.0 - fresnel(min(facing, 1.0))) / VARNISH_ADMITS
+    direct, rise = F32(arrives * facing * sun_enters), F32(-seen.normal[2])
+    for k in range(3):
+        bright = irradiance(light, k, direct, rise)
+        colour[k] += seen.share[k] * enters * seen.albedo[k] * bright
+
+
+@large_borrowing_kernel
+def _shine(colour: NDArray[np.float64], seen: Seen, kind: int, light: Lit, arrives: float) -> None:
+    """Add the sun's highlight on a rough surface; a mirror shows it as the point that it is."""
+    if arrives == 0.0 or is_smooth(seen.alpha):
+        return
+    value, cosine = highlight(seen.alpha, seen.normal, seen.ray, _sun(light))
+    if kind == METAL:
+        _add(colour, _times(seen.share, seen.albedo), light.sun, arrives * value)
+    else:
+        back = fresnel(min(max(cosine, 0.0), 1.0))
+        _add(colour, seen.share, light.sun, arrives * value * back)
+
+
+@large_borrowing_kernel
+def _mirror(tree: NDArray[np.float64], tops: int, seen: Seen, kind: int) -> int:
+    """Go on where metal or varnish mirrors; return how many rays wait."""
+    many = 1 if seen.depth > 0 or is_smooth(seen.alpha) else SAMPLES
+    for number in range(many):
+        u, v = spread(number)
+        shine = seen.normal if many == 1 else facet(seen.alpha, seen.normal, seen.ray, u, v)
+        away = mirrored(seen.ray, shine)
+        gives = 1.0 if many == 1 else facet_gives(seen.alpha, seen.normal, away) / many
+        share = _scaled(seen.share, gives)
+        if kind == METAL:
+            share = _times(share, seen.albedo)
+        else:
+            share = _scaled(share, fresnel(min(max(-dot(shine, seen.ray), 0.0), 1.0)))
+        tops = _grown(tree, tops, seen, away, share)
+    return tops
+
+
+@large_borrowing_kernel
+def _albedo(
+    look: Look,
+    row: int,
+    bodies: Bodies,
+    met: Met,
+    place: Place,
+    meshes: Meshes | None,
+    ray: Vec,
+    way: float,
+    pixel2: np.float32,
+) -> Vec:
+    """Return the linear RGB albedo of a surface where a ray meets it."""
+    surface = surface_of(look.texture, look.per_m, look.offset, look.albedo, row)
+    a, b, c = F32(place.at[0]), F32(place.at[1]), F32(place.at[2])
+    per_m, per_turn = surface.per_m, F32(0.0)
+    across, along, in_periods = ZERO, ZERO, False
+    if met.mesh >= 0:
+        if meshes is not None:
+            n = meshes.bvh.normals[met.face]
+            across, along = on_triangle(a, b, c, n[0], n[1], n[2])
+    elif met.seen == FLOOR:
+        across, along = b, -a
+    elif met.seen < OBSTACLE:
+        across, along = (b if met.seen == WALL_NORTH_SOUTH else a), c
+    else:
+        shape, radius = bodies.shape[met.seen - OBSTACLE], bodies.half_size[met.seen - OBSTACLE, 0]
+        if shape == BOX:
+            across, along = on_box(a, b, c, place.side == 2, place.side == 0)
+        else:
+            per_turn, in_periods = periods_around(radius, per_m), True
+            if shape == CYLINDER:
+                across, along = on_cylinder(a, b, c, place.side == 2, per_m, per_turn)
+            else:
+                across, along = on_sphere(a, b, c, per_turn)
+    if not in_periods:
+        across, along = across * per_m, along * per_m
+    steep = max(F32(-dot(place.normal, ray)), STEEP)
+    texels = texels2(surface, pixel2) * F32(way) * F32(way) / steep
+    at = texel_at(across + surface.offset[0], along + surface.offset[1], texels)
+    red = look.atlas[np.uint64(surface.base + at)]
+    green, blue = red, red
+    if surface.step != 0:
+        green = look.atlas[np.uint64(surface.base + surface.step + at)]
+        blue = look.atlas[np.uint64(surface.base + 2 * surface.step + at)]
+    dark, more = surface.albedo, surface.more
+    return (
+        float(dark[0] + more[0] * red),
+        float(dark[1] + more[1] * green),
+        float(dark[2] + more[2] * blue),
+    )
+
+
+@kernel
+def _sky(light: Lit, ray: Vec, down: float) -> Vec:
+    """Return the sky's linear RGB, and below the horizon the ground's, as `draw_sky` has them.
+
+    `down`: of where the ray begins, NED [m].
+    """
+    rise, through = -ray[2], 1.0
+    if light.extinction > 0.0:
+        thick = FOG_LAYER_M if rise > 0.0 else max(-down, 1e-3)
+        through = math.exp(-float(light.extinction) * thick / max(abs(rise), 1e-6))
+    horizon = (float(light.horizon[0]), float(light.horizon[1]), float(light.horizon[2]))
+    end = light.zenith if rise >= 0.0 else light.ground
+    share = through * (rise if rise >= 0.0 else 1.0)
+    return (
+        horizon[0] + share * (float(end[0]) - horizon[0]),
+        horizon[1] + share * (float(end[1]) - horizon[1]),
+        horizon[2] + share * (float(end[2]) - horizon[2]),
+    )

@@ -1,0 +1,329 @@
+"""Single rays through an arena: what one meets first, and how much of the sun reaches a point.
+
+Images are drawn body by body (`raycast`, `shadows`), all rays of the camera at once. This is for
+rays that begin anywhere else, of which there are few: what surfaces mirror and what glass lets
+through. In float64; a ray is a unit vector.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.arena.appearance import OBSTACLE as OBSTACLE_ROW
+from airl_mav.arena.appearance import WALLS as WALLS_ROW
+from airl_mav.camera.bvh import Meshes, is_owned, material_row
+from airl_mav.camera.mesh_rays import distance_to, stopped_by
+from airl_mav.camera.meshes import inverse_of
+from airl_mav.camera.primitives import (
+    BOX,
+    CEILING,
+    CYLINDER,
+    FLOOR,
+    OBSTACLE,
+    SKY,
+    WALL_EAST_WEST,
+    WALL_NORTH_SOUTH,
+)
+from airl_mav.camera.projection import dot
+from airl_mav.core.kernels import borrowing_kernel, kernel, large_borrowing_kernel
+from airl_mav.vehicle.rotation import Vec
+
+LEAST_M: Final = 1e-4
+"""What is nearer to where a ray begins is what it begins on [m]."""
+
+
+class Bodies(NamedTuple):
+    """The obstacles of an arena, and its room, as `render_depth` takes them; see `bodies_of`."""
+
+    bounds: NDArray[np.float64]  # (6,)
+    shape: NDArray[np.int8]  # (n,)
+    center: NDArray[np.float64]  # (n, 3)
+    half_size: NDArray[np.float64]  # (n, 3)
+    turn: NDArray[np.float64]  # (n, 2) cosine and sine of the heading of its axes
+    reach: NDArray[np.float64]  # (n,) square of the radius of a sphere around each [m²]
+
+
+class Met(NamedTuple):
+    """What a ray meets first."""
+
+    distance: float
+    """Along the ray [m]; infinite: it meets nothing."""
+    seen: int
+    """SKY, FLOOR, ... of `primitives`; of a mesh that of the first obstacle it owns, or GROUND."""
+    mesh: int
+    """Number of the mesh; -1: it is none."""
+    face: int
+    """Which of its triangles."""
+
+
+class Place(NamedTuple):
+    """A point of a body along its own axes."""
+
+    at: Vec
+    """From the body's middle, or the mesh's origin [m]; of room and floor: NED."""
+    normal: Vec
+    """Unit vector NED on the side that the ray comes from."""
+    side: int
+    """0, 1 or 2: across the body's first, second or vertical axis; 3: all round it."""
+
+
+@kernel
+def bodies_of(
+    bounds: NDArray[np.float64],
+    shape: NDArray[np.int8],
+    center: NDArray[np.float64],
+    half_size: NDArray[np.float64],
+    yaw: NDArray[np.float64],
+) -> Bodies:
+    """Return the bodies of an arena, with what all rays need of them."""
+    n = len(shape)
+    turn, reach = np.empty((n, 2)), np.empty(n)
+    for i in range(n):
+        turn[i, 0], turn[i, 1] = 1.0, 0.0
+        a, b, c = half_size[i, 0], half_size[i, 1], half_size[i, 2]
+        if shape[i] == BOX:
+            turn[i, 0], turn[i, 1] = math.cos(yaw[i]), math.sin(yaw[i])
+            reach[i] = a * a + b * b + c * c
+        else:
+            reach[i] = a * a + c * c if shape[i] == CYLINDER else a * a
+    return Bodies(bounds, shape, center, half_size, turn, reach)
+
+
+@kernel
+def advanced(origin: Vec, ray: Vec, distance: float) -> Vec:
+    """Return the point so far along a ray."""
+    return (
+        origin[0] + distance * ray[0],
+        origin[1] + distance * ray[1],
+        origin[2] + distance * ray[2],
+    )
+
+
+@kernel
+def _turned(v: Vec, cos: float, sin: float) -> Vec:
+    """Return a vector along axes that are turned about the vertical."""
+    return (cos * v[0] + sin * v[1], cos * v[1] - sin * v[0], v[2])
+
+
+@large_borrowing_kernel
+def _span(bodies: Bodies, i: int, origin: Vec, ray: Vec) -> tuple[float, float]:
+    """Return where a ray enters an obstacle and leaves it; it leaves before it enters: never."""
+    center, half = bodies.center[i], bodies.half_size[i]
+    away = (origin[0] - center[0], origin[1] - center[1], origin[2] - center[2])
+    # Most rays pass by it.
+    apart, ahead = dot(away, away) - bodies.reach[i], dot(away, ray)
+    if apart > 0.0 and (ahead > 0.0 or ahead * ahead < apart):
+        return math.inf, -math.inf
+    cos, sin = bodies.turn[i, 0], bodies.turn[i, 1]
+    o, d = _turned(away, cos, sin), _turned(ray, cos, sin)
+    if bodies.shape[i] == BOX:
+        i0, i1, i2 = inverse_of(d[0]), inverse_of(d[1]), inverse_of(d[2])
+        a, b, c = -o[0] * i0, -o[1] * i1, -o[2] * i2
+        w0, w1, w2 = half[0] * abs(i0), half[1] * abs(i1), half[2] * abs(i2)
+        return max(max(a - w0, b - w1), c - w2), min(min(a + w0, b + w1), c + w2)
+    if bodies.shape[i] == CYLINDER:
+        level = max(d[0] * d[0] + d[1] * d[1], 1e-18)
+        toward = -(o[0] * d[0] + o[1] * d[1])
+        rest = level * (half[0] * half[0] - o[0] * o[0] - o[1] * o[1]) + toward * toward
+        if rest <= 0.0:
+            return math.inf, -math.inf
+        root, i2 = math.sqrt(rest), inverse_of(d[2])
+        c, w2 = -o[2] * i2, half[2] * abs(i2)
+        return max((toward - root) / level, c - w2), min((toward + root) / level, c + w2)
+    toward = -dot(o, d)
+    rest = half[0] * half[0] - dot(o, o) + toward * toward
+    if rest <= 0.0:
+        return math.inf, -math.inf
+    root = math.sqrt(rest)
+    return toward - root, toward + root
+
+
+@borrowing_kernel
+def _room(bounds: NDArray[np.float64], origin: Vec, ray: Vec) -> tuple[float, int]:
+    """Return what a ray meets of floor, walls and ceiling: how far away, and which."""
+    best, seen = math.inf, SKY
+    for side in range(4):
+        axis = side // 2
+        t = (bounds[side] - origin[axis]) * inverse_of(ray[axis])
+        if t <= LEAST_M or t >= best:
+            continue
+        p = advanced(origin, ray, t)
+        other = 1 - axis
+        inside = bounds[2 * other] <= p[other] <= bounds[2 * other + 1]
+        if inside and -bounds[4] <= p[2] <= 0.0:
+            best, seen = t, WALL_NORTH_SOUTH if axis == 0 else WALL_EAST_WEST
+    for lid in range(2 if bounds[5] > 0.0 else 1):
+        t = ((-bounds[4] if lid else 0.0) - origin[2]) * inverse_of(ray[2])
+        if t <= LEAST_M or t >= best:
+            continue
+        p = advanced(origin, ray, t)
+        if bounds[0] <= p[0] <= bounds[1] and bounds[2] <= p[1] <= bounds[3]:
+            best, seen = t, CEILING if lid else FLOOR
+    return best, seen
+
+
+@borrowing_kernel
+def _from_mesh(meshes: Meshes, k: int, origin: Vec, ray: Vec) -> tuple[Vec, Vec]:
+    """Return a ray from mesh k's origin, along its axes and in units of it; the ray is a unit's."""
+    cos, sin, per = meshes.pose[k, 2], meshes.pose[k, 3], 1.0 / meshes.pose[k, 4]
+    offset = (
+        per * (origin[0] - meshes.pose[k, 0]),
+        per * (origin[1] - meshes.pose[k, 1]),
+        per * (origin[2] - meshes.pose[k, 5]),
+    )
+    return _turned(offset, cos, sin), _turned(ray, cos, sin)
+
+
+@large_borrowing_kernel
+def meet(
+    bodies: Bodies, meshes: Meshes | None, origin: Vec, ray: Vec, waiting: NDArray[np.int32]
+) -> Met:
+    """Return what a ray meets first.
+
+    Args:
+        bodies: Obstacles and room.
+        meshes: Those that are seen; None: there are none.
+        origin: (3,) where it begins, NED [m].
+        ray: (3,) unit vector NED.
+        waiting: (STACK,) room to work in.
+    """
+    best, seen = _room(bodies.bounds, origin, ray)
+    mesh, face = -1, -1
+    for i in range(len(bodies.shape)):
+        if is_owned(meshes, i):
+            continue
+        enter, leave = _span(bodies, i, origin, ray)
+        if leave < enter:
+            continue
+        t = enter if enter > LEAST_M else leave
+        if LEAST_M < t < best:
+            best, seen = t, OBSTACLE + i
+    if meshes is not None:
+        for k in range(len(meshes.root)):
+            scale = meshes.pose[k, 4]
+            at, way = _from_mesh(meshes, k, origin, ray)
+            t, which = distance_to(
+                meshes.bvh, meshes.root[k], at, way, LEAST_M / scale, best / scale, waiting
+            )
+            if which >= 0:
+                best, seen, mesh, face = t * scale, OBSTACLE + meshes.first[k], k, which
+    return Met(best, seen, mesh, face)
+
+
+@large_borrowing_kernel
+def place_of(bodies: Bodies, meshes: Meshes | None, met: Met, origin: Vec, ray: Vec) -> Place:
+    """Return where on a body a ray meets it: any body but ceiling and sky."""
+    p = advanced(origin, ray, met.distance)
+    if meshes is not None and met.mesh >= 0:
+        return _on_mesh(meshes, met, p, ray)
+    if met.seen >= OBSTACLE:
+        return _on_obstacle(bodies, met.seen - OBSTACLE, p, ray)
+    axis = 2 if met.seen == FLOOR else (0 if met.seen == WALL_NORTH_SOUTH else 1)
+    sign = -1.0 if ray[axis] > 0.0 else 1.0
+    return Place(p, _scaled_axis(axis, sign), axis)
+
+
+@kernel
+def _scaled_axis(axis: int, by: float) -> Vec:
+    """Return the unit vector of an axis, times a factor."""
+    return (
+        by if axis == 0 else 0.0,
+        by if axis == 1 else 0.0,
+        by if axis == 2 else 0.0,
+    )
+
+
+@kernel
+def _towards(normal: Vec, ray: Vec) -> Vec:
+    """Return a normal to the side that a ray comes from."""
+    sign = -1.0 if dot(normal, ray) > 0.0 else 1.0
+    return (sign * normal[0], sign * normal[1], sign * normal[2])
+
+
+@borrowing_kernel
+def _on_mesh(meshes: Meshes, met: Met, p: Vec, ray: Vec) -> Place:
+    """Return where on a mesh the point p lies."""
+    k, n = met.mesh, meshes.bvh.normals[met.face]
+    scale, cos, sin = meshes.pose[k, 4], meshes.pose[k, 2], meshes.pose[k, 3]
+    at, _ = _from_mesh(meshes, k, p, ray)
+    normal = _turned((float(n[0]), float(n[1]), float(n[2])), cos, -sin)
+    return Place((scale * at[0], scale * at[1], scale * at[2]), _towards(normal, ray), 3)
+
+
+@borrowing_kernel
+def _on_obstacle(bodies: Bodies, i: int, p: Vec, ray: Vec) -> Place:
+    """Return where on obstacle i the point p lies."""
+    center, half = bodies.center[i], bodies.half_size[i]
+    cos, sin = bodies.turn[i, 0], bodies.turn[i, 1]
+    a, b, c = _turned((p[0] - center[0], p[1] - center[1], p[2] - center[2]), cos, sin)
+    side = 3
+    if bodies.shape[i] == BOX:
+        qa, qb, qc = abs(a) / half[0], abs(b) / half[1], abs(c) / half[2]
+        side = 2 if qc >= max(qa, qb) else (0 if qa >= qb else 1)
+        outward = c if side == 2 else (a if side == 0 else b)
+        normal = _scaled_axis(side, math.copysign(1.0, outward))
+    elif bodies.shape[i] == CYLINDER and abs(c) / half[2] * half[0] >= math.hypot(a, b):
+        side = 2
+        normal = _scaled_axis(side, math.copysign(1.0, c))
+    else:
+        height = 0.0 if bodies.shape[i] == CYLINDER else c
+        per = 1.0 / max(math.sqrt(a * a + b * b + height * height), 1e-9)
+        normal = (per * a, per * b, per * height)
+    # Inside glass the far side is seen from within.
+    return Place((a, b, c), _towards(_turned(normal, cos, -sin), ray), side)
+
+
+@large_borrowing_kernel
+def sunlight(
+    bodies: Bodies,
+    meshes: Meshes | None,
+    lets: NDArray[np.float32],
+    own: int,
+    at: Vec,
+    to_sun: Vec,
+    waiting: NDArray[np.int32],
+) -> float:
+    """Return the share of the sun's light that reaches a point: 1 in the sun, 0 in shadow.
+
+    Args:
+        bodies: Obstacles and room.
+        meshes: Those that are seen; None: there are none.
+        lets: (2 + n,) share that each surface lets through, `Gloss.lets`.
+        own: What the point lies on, as `Met.seen`: a convex body is dark where it faces away.
+        at: (3,) the point, off the surface by a little where that is a mesh's, NED [m].
+        to_sun: (3,) unit vector NED.
+        waiting: (STACK,) room to work in.
+    """
+    share = 1.0
+    bounds = bodies.bounds
+    for side in range(4):
+        axis = side // 2
+        t = (bounds[side] - at[axis]) * inverse_of(to_sun[axis])
+        if t <= 1e-3:
+            continue
+        p = advanced(at, to_sun, t)
+        other = 1 - axis
+        if bounds[2 * other] <= p[other] <= bounds[2 * other + 1] and -bounds[4] <= p[2] <= 0.0:
+            share *= lets[WALLS_ROW]
+    for i in range(len(bodies.shape)):
+        if share == 0.0:
+            return 0.0
+        if is_owned(meshes, i) or own == OBSTACLE + i:
+            continue
+        enter, leave = _span(bodies, i, at, to_sun)
+        if leave >= max(enter, 0.0):
+            share *= lets[OBSTACLE_ROW + i]
+    if meshes is not None:
+        for k in range(len(meshes.root)):
+            if share == 0.0:
+                return 0.0
+            place, way = _from_mesh(meshes, k, at, to_sun)
+            least = LEAST_M / meshes.pose[k, 4]
+            inverse = (inverse_of(way[0]), inverse_of(way[1]), inverse_of(way[2]))
+            if stopped_by(meshes.bvh, meshes.root[k], place, way, inverse, least, -1, waiting) >= 0:
+                share *= lets[material_row(meshes, k)]
+    return share
