@@ -14,7 +14,14 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.appearance import OBSTACLE, WALLS, Drawn, Statics, draw_appearance
+from airl_mav.arena.appearance import (
+    OBSTACLE,
+    SURFACES,
+    WALLS,
+    Drawn,
+    Statics,
+    draw_appearance,
+)
 from airl_mav.arena.ground import Ground
 from airl_mav.arena.indoors import indoors
 from airl_mav.core.constants import US_PER_S
@@ -119,7 +126,7 @@ class Arena:
     tours: tuple[Tour, ...]
     goal: NDArray[np.float64]  # (2,) north, east [m] from the start
     appearance: Appearance = DEFAULT
-    """What the look is drawn from; geometry and depth know none of it."""
+    """What the look is drawn from; geometry knows none of it, and depth nothing but glass."""
     statics: Statics | None = None
     """None: every primitive that stands is a thing of its own."""
     meshes: tuple[PlacedMesh, ...] = ()
@@ -151,6 +158,15 @@ class Arena:
             self.statics,
         )
         return self._indoors(look) if self.bounds.ceiling else look
+
+    @cached_property
+    def clear(self) -> NDArray[np.bool_] | None:
+        """Which obstacles (n,) are of glass, that depth passes through; None: there are none."""
+        parts = () if self.statics is None else self.statics.materials
+        if not self.appearance.may_have("glass", (name for name in parts if name is not None)):
+            return None
+        glass = self.look.finish.surface[OBSTACLE:] == SURFACES.index("glass")
+        return glass if glass.any() else None
 
     def _indoors(self, look: Drawn) -> Drawn:
         """Return a look with the light that there is below the ceiling."""

@@ -241,17 +241,30 @@ class Forest(NamedTuple):
     roots: dict[MeshFile | None, int]
 
 
+NO_TREES: Final = Forest(
+    Bvh(
+        np.zeros((0, 6), np.float32),
+        np.zeros((0, 2), np.int32),
+        np.zeros((0, 9), np.float32),
+        np.zeros((0, 3), np.float32),
+    ),
+    {},
+)
+
+
 @lru_cache(maxsize=4)
 def forest_of(files: tuple[MeshFile, ...], ground: Ground | None = None) -> Forest:
-    """Return the trees of meshes, and of the ground, in one. Raises UsageError as `triangles_of`.
+    """Return the trees of meshes, and of the ground, in one.
 
-    There is one at least.
+    Raises UsageError as `triangles_of`.
     """
     names: list[MeshFile | None] = [*files]
     trees = [bvh_of(file) for file in files]
     if ground is not None:
         names.append(None)
         trees.append(ground_tree(ground))
+    if not trees:
+        return NO_TREES
     if len(trees) == 1:
         return Forest(trees[0], {names[0]: 0})
     nodes = np.cumsum([0, *(len(tree.boxes) for tree in trees)])
@@ -277,6 +290,10 @@ GROUND_POSE: Final = (0.0, 0.0, 0.0, 1.0, 1.0, 0.0)
 """`Meshes.pose` of the ground: its first axis is east."""
 
 
+UNSEEN: Final = 1 << 30
+"""`Meshes.owner` of an obstacle that depth passes through: nothing is seen in its place."""
+
+
 class Meshes(NamedTuple):
     """The meshes of an arena as kernels take them: k that stand somewhere.
 
@@ -284,7 +301,8 @@ class Meshes(NamedTuple):
     """
 
     bvh: Bvh
-    owner: NDArray[np.int32]  # (n,) the mesh that each obstacle is a part of, -1: of none
+    owner: NDArray[np.int32]
+    """(n,) the mesh that each obstacle is a part of; -1: of none; UNSEEN."""
     first: NDArray[np.int32]  # (k,) the obstacle whose number and material it has; GROUND_FIRST
     root: NDArray[np.int32]  # (k,) root of its tree
     pose: NDArray[np.float64]
@@ -317,30 +335,48 @@ def raised(meshes: Meshes | None, position: Vec | NDArray[np.float64]) -> Vec:
 
 @borrowing_kernel
 def is_owned(meshes: Meshes | None, i: int) -> bool:
-    """Return whether cameras see a mesh in place of obstacle i."""
+    """Return whether cameras see a mesh in place of obstacle i, or nothing."""
     return False if meshes is None else meshes.owner[i] >= 0
 
 
 def meshes_of(
-    placed: tuple[PlacedMesh, ...], n_obstacles: int, ground: Ground | None = None
+    placed: tuple[PlacedMesh, ...],
+    n_obstacles: int,
+    ground: Ground | None = None,
+    clear: NDArray[np.bool_] | None = None,
 ) -> Meshes | None:
-    """Return the meshes of an arena, hills among them; None: it has none.
+    """Return the meshes of an arena, hills among them; None: it has none, and no glass.
+
+    Args:
+        placed: The meshes.
+        n_obstacles: Obstacles of the arena.
+        ground: Its hills.
+        clear: (n,) obstacles that depth passes through, `Arena.clear`; None: it passes none, or
+            these are for a colour camera.
 
     Raises:
         UsageError: The file of one cannot be read, or is another one.
     """
-    if not placed and ground is None:
+    if not placed and ground is None and clear is None:
         return None
     forest = forest_of(tuple(dict.fromkeys(each.file for each in placed)), ground)
-    rows = placed_in(forest.roots, placed, n_obstacles)
+    rows = placed_in(forest.roots, placed, n_obstacles, clear)
     return Meshes(forest.bvh, *rows, no_relief() if ground is None else ground.relief)
 
 
 def placed_in(
-    roots: dict[MeshFile | None, int], placed: tuple[PlacedMesh, ...], n_obstacles: int
+    roots: dict[MeshFile | None, int],
+    placed: tuple[PlacedMesh, ...],
+    n_obstacles: int,
+    clear: NDArray[np.bool_] | None = None,
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32], NDArray[np.float64]]:
-    """Return `owner`, `first`, `root` and `pose` of `Meshes`; hills where `roots` has them."""
+    """Return `owner`, `first`, `root` and `pose` of `Meshes`; hills where `roots` has them.
+
+    `clear` as of `meshes_of`. A mesh of glass stays what it is: depth ends on it.
+    """
     owner = np.full(n_obstacles, -1, np.int32)
+    if clear is not None:
+        owner[clear] = UNSEEN
     for k, each in enumerate(placed):
         owner[each.first : each.first + each.count] = k
     first = [each.first for each in placed]

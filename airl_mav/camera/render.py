@@ -97,6 +97,8 @@ def render(
 ) -> NDArray[np.float32]:
     """Return the depth image (height, width) [m] of an arena; 0 = no return.
 
+    Depth passes through obstacles of glass, and sees what is behind them.
+
     Args:
         arena: What is seen.
         centers: (n, 3) present obstacle centres NED [m], as `Arena.centers_at` gives them.
@@ -124,7 +126,7 @@ def render(
         centers,
         obstacles.half_size,
         obstacles.yaw,
-        meshes_of(arena.meshes, len(obstacles), arena.ground),
+        meshes_of(arena.meshes, len(obstacles), arena.ground, arena.clear),
         bent_of(k),
     )
     return image

@@ -113,7 +113,7 @@ class Eyes:
         if self._formed is not None:
             self._formed.render(fleet, who, seeds, frames, image)
         elif self._colour is None:
-            render_images(fleet, arenas, who, self._mount, self._lens, image, self._meshes.batch)
+            render_images(fleet, arenas, who, self._mount, self._lens, image, self._meshes.by_depth)
         else:
             self._colour.render(fleet, arenas, who, image)
         if self._noise is not None:

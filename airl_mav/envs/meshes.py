@@ -14,19 +14,9 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena
 from airl_mav.arena.ground import Relief
-from airl_mav.camera.bvh import Bvh, Forest, Meshes, forest_of, ground_tree, placed_in
+from airl_mav.camera.bvh import UNSEEN, Bvh, Forest, Meshes, forest_of, ground_tree, placed_in
 from airl_mav.core.kernels import kernel
 from airl_mav.profiles.mesh_file import MeshFile
-
-_NO_TREES = Forest(
-    Bvh(
-        np.zeros((0, 6), np.float32),
-        np.zeros((0, 2), np.int32),
-        np.zeros((0, 9), np.float32),
-        np.zeros((0, 3), np.float32),
-    ),
-    {},
-)
 
 
 class MeshBatch(NamedTuple):
@@ -60,10 +50,17 @@ class MeshesSeen:
     def __init__(self, n: int) -> None:
         """Know none yet."""
         self.batch: MeshBatch | None = None
-        """What the kernels look at; None: no arena has had a mesh, and nothing is spent on any."""
+        """What colour cameras look at; None: no arena has had a mesh, and nothing is spent on any.
+        """
+        self.by_depth: MeshBatch | None = None
+        """What depth passes by and ends on: `batch`, without what is of glass; None as there."""
         self._arenas: list[Arena | None] = [None] * n
         self._files: dict[MeshFile, None] = {}
         """All that have been seen, in order."""
+        self._glass = False
+        """Whether any arena has had an obstacle of glass."""
+        self._bare: MeshBatch | None = None
+        """What there is in place of `batch` where there is glass, and no mesh."""
         self._room = (0, 0)
         """Nodes and triangles that there is room for in the tree of each arena's ground."""
 
@@ -76,13 +73,40 @@ class MeshesSeen:
         self._arenas[i] = arena
         before = len(self._files)
         self._files.update(dict.fromkeys(each.file for each in arena.meshes))
-        if not self._files and arena.ground is None and self.batch is None:
+        forest = forest_of(tuple(self._files))
+        if self._files or arena.ground is not None or self.batch is not None:
+            batch = self.batch
+            if batch is None or len(self._files) > before or not self._fits(batch, arena):
+                self.batch = batch = self._made(forest)
+            self._put(batch, forest, i, arena)
+        self._leave_glass_out(i, arena)
+
+    def _leave_glass_out(self, i: int, arena: Arena) -> None:
+        """Bring `by_depth` up to date with slot i's arena, and with `batch`."""
+        if not self._glass and arena.clear is None:
+            self.by_depth = self.batch
             return
-        forest = forest_of(tuple(self._files)) if self._files else _NO_TREES
-        batch = self.batch
-        if batch is None or len(self._files) > before or not self._fits(batch, arena):
-            self.batch = batch = self._made(forest)
-        self._put(batch, forest, i, arena)
+        self._glass = True
+        present = [i]
+        shown, depth = self.batch, self.by_depth
+        if shown is None:
+            shown = self._bare = self._bare or self._made(forest_of(()))
+        if (
+            depth is None
+            or depth.bvh is not shown.bvh
+            or depth.owner.shape[1] < len(arena.obstacles)
+        ):
+            present = [k for k, each in enumerate(self._arenas) if each is not None]
+            most = max(len(each.obstacles) for each in self._arenas if each is not None)
+            room = len(self._arenas), max(most, shown.owner.shape[1])
+            self.by_depth = depth = shown._replace(owner=np.full(room, -1, np.int32))
+        width = shown.owner.shape[1]
+        for k in present:
+            depth.owner[k] = -1
+            depth.owner[k, :width] = shown.owner[k]
+            each = self._arenas[k]
+            if each is not None and each.clear is not None:
+                depth.owner[k, : len(each.obstacles)][each.clear] = UNSEEN
 
     def restore(self, arenas: Sequence[Arena | None]) -> None:
         """Take the meshes of all slots again; None: no episode has begun there."""

@@ -5,6 +5,7 @@ Every pair of numbers is [least, greatest], drawn uniformly for each seed. Colou
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
@@ -228,7 +229,7 @@ class Fog(ProfileModel):
 class Appearance(ProfileModel):
     """What a colour camera sees. It has random streams of its own: the geometry knows none of it.
 
-    Depth images know none of it either.
+    Depth images know none of it either, but for glass, which depth passes through.
     """
 
     period: int = quantity(
@@ -272,6 +273,14 @@ class Appearance(ProfileModel):
         """The pictures of its own materials, each once, in the order of their names."""
         named = sorted(self.materials.items())
         return tuple(dict.fromkeys(m.image for _, m in named if m.image is not None))
+
+    def may_have(self, surface: SurfaceName, more: Iterable[str] = ()) -> bool:
+        """Return whether any obstacle may have such a surface.
+
+        `more`: the names of further materials that parts of them have.
+        """
+        kinds = (*self.static.materials, *self.moving.materials, *more)
+        return any(self.material(name, (0, 0, 0)).surface == surface for name in kinds)
 
     def material(self, name: str, wall_colour: tuple[int, int, int]) -> Material:
         """Return a material by name; one of the arena's own goes before a shipped one."""

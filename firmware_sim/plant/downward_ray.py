@@ -47,7 +47,7 @@ class DownwardRay:
             bodies = arena.obstacles
             self._shapes = bodies.shape, bodies.half_size, bodies.yaw
             self._still = bodies.center
-            self._meshes = meshes_of(arena.meshes, len(bodies), arena.ground)
+            self._meshes = meshes_of(arena.meshes, len(bodies), arena.ground, arena.clear)
         # The first ray loads or compiles the kernels: better here than in flight.
         self.length_m(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), 0)
 
