@@ -46,6 +46,7 @@ class _Part(IntEnum):
     WALLS = 4
     STATIC = 5
     MOVING = 6
+    RAIN = 7
 
 
 @dataclass(frozen=True)
@@ -116,6 +117,7 @@ class Drawn:
 
     finish: Finish
     light: Light
+    drops: NDArray[np.float32]  # (k, 4) of rain on the lens, as of `lens_drops.draw_drops`
 
 
 def draw_appearance(
@@ -167,7 +169,7 @@ def draw_appearance(
         roughness,
         appearance.images,
     )
-    return Drawn(finish, _light(appearance, draw))
+    return Drawn(finish, _light(appearance, draw), _drops(appearance, draw))
 
 
 def _surfaces(
@@ -257,6 +259,18 @@ def _light(appearance: Appearance, draw: int) -> Light:
         horizon=scale * horizon,
         extinction=float(extinction),
     )
+
+
+def _drops(appearance: Appearance, draw: int) -> NDArray[np.float32]:
+    """Draw the drops of rain on the lens, drop by drop."""
+    rain, rng = appearance.rain, stream(draw, Stream.APPEARANCE, _Part.RAIN)
+    least, most = rain.drops
+    wet, number = rng.random() < rain.share, rng.integers(least, most, endpoint=True)
+    draws = rng.random((int(number) if wet else 0, 4))
+    (narrow, wide), (round_, long) = rain.size, rain.streak
+    draws[:, 2] = narrow + (wide - narrow) * draws[:, 2]
+    draws[:, 3] = round_ + (long - round_) * draws[:, 3]
+    return draws.astype(np.float32)
 
 
 def linear_of(encoded: Floats) -> Floats:

@@ -16,6 +16,7 @@ from airl_mav.camera.colour import Work, render_colour
 from airl_mav.camera.fisheye import bent_of
 from airl_mav.camera.gloss import Gloss
 from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.lens_drops import rained_on
 from airl_mav.camera.rays import finer
 from airl_mav.camera.textures import atlas, mean_of, periods
 from airl_mav.core.kernels import kernel
@@ -116,6 +117,7 @@ def render_picture(
         atlas(arena.look.finish.images),
         bent_of(k),
     )
+    rained_on(picture.rgb, arena.look.drops)
     return picture
 
 

@@ -13,7 +13,9 @@ from airl_mav.arena.geometry import Arena
 from airl_mav.camera.colour import Work, render_colour
 from airl_mav.camera.fisheye import bent_of
 from airl_mav.camera.gloss import MATT, Gloss
+from airl_mav.camera.image_sensor import LIGHT_OF
 from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.lens_drops import draw_drops
 from airl_mav.camera.picture import ColourArrays, write_grey
 from airl_mav.camera.projection import Bent
 from airl_mav.camera.render import Mount, camera_pose
@@ -51,6 +53,13 @@ def _all_matt(n: int, surfaces: int) -> GlossBatch:
     )
 
 
+class RainBatch(NamedTuple):
+    """The drops on the lenses in n arenas, padded to the most; see `camera.lens_drops`."""
+
+    present: NDArray[np.int64]  # (n,) number of them
+    drops: NDArray[np.float32]  # (n, k, 4)
+
+
 def _empty(n: int, surfaces: int) -> LookBatch:
     return LookBatch(
         np.zeros((n, surfaces), np.int8),
@@ -72,6 +81,8 @@ class Looks:
         """What the kernel looks at; replaced where an arena has more surfaces than all before."""
         self.gloss: GlossBatch | None = None
         """As `batch`; None: all surfaces have been matt, and nothing is spent on others."""
+        self.rain: RainBatch | None = None
+        """As `batch`; None: no lens has been wet, and nothing is spent on drops."""
         self.images: tuple[ImageFile, ...] = ()
         """Textures from files, of all arenas."""
 
@@ -110,6 +121,20 @@ class Looks:
         if self.gloss is not None and look.gloss is not None:
             for name, rows in look.gloss._asdict().items():
                 getattr(self.gloss, name)[i, :count] = rows
+        self._wet(i, arena.look.drops)
+
+    def _wet(self, i: int, drops: NDArray[np.float32]) -> None:
+        """Take the drops on slot i's lens."""
+        rain, n = self.rain, len(self.batch.texture)
+        if rain is None:
+            if not len(drops):
+                return
+            self.rain = rain = RainBatch(np.zeros(n, np.int64), np.zeros((n, 0, 4), np.float32))
+        if len(drops) > rain.drops.shape[1]:
+            larger = RainBatch(np.zeros(n, np.int64), np.zeros((n, len(drops), 4), np.float32))
+            copy_rows(rain, larger)
+            self.rain = rain = larger
+        rain.present[i], rain.drops[i, : len(drops)] = len(drops), drops
 
     def restore(self, arenas: Sequence[Arena | None]) -> None:
         """Take the looks of all slots again; None: no episode has begun there."""
@@ -130,24 +155,29 @@ class ColourImages:
         self._mount, self._looks, self._meshes = mount, looks, meshes
         self._work = Work.of(k.width, k.height, k.cylindrical)
         shape = (k.height, k.width)
-        self._rgb = np.zeros((*shape, 3), np.uint8)
+        self._rgb, self._dry = np.zeros((2, *shape, 3), np.uint8)
         self._depth, self._seen = np.zeros(shape, np.float32), np.zeros(shape, np.int32)
 
     def render(
         self, fleet: Fleet, arenas: ArenaBatch, who: NDArray[np.bool_], out: NDArray[Any]
     ) -> None:
         """Write the images (n, h, w, 3), or (n, h, w, 1) in grey, of the vehicles in `who` (n,)."""
-        room = self._work, self._rgb, self._depth, self._seen
         render_colour_images(
             fleet,
             arenas,
             self._looks.batch,
             self._looks.gloss,
+            self._looks.rain,
             self._meshes.batch,
             who,
             self._mount,
             *self._lens,
-            *room,
+            self._work,
+            self._rgb,
+            self._depth,
+            self._seen,
+            self._dry,
+            LIGHT_OF,
             atlas(self._looks.images),
             self._bent,
             out,
@@ -166,6 +196,7 @@ def render_colour_images(
     arenas: ArenaBatch,
     looks: LookBatch,
     gloss: GlossBatch | None,
+    rain: RainBatch | None,
     meshes: MeshBatch | None,
     who: NDArray[np.bool_],
     mount: Mount,
@@ -177,6 +208,8 @@ def render_colour_images(
     rgb: NDArray[np.uint8],
     depth: NDArray[np.float32],
     seen: NDArray[np.int32],
+    dry: NDArray[np.uint8],
+    light_of: NDArray[np.float32],
     patterns: NDArray[np.float32],
     bent: Bent | None,
     out: NDArray[np.uint8],
@@ -188,6 +221,7 @@ def render_colour_images(
         arenas: One a vehicle; moving obstacles are put where they are at its time.
         looks: One an arena.
         gloss: With `looks`; None: all surfaces are matt.
+        rain: Drops on the lenses; None: they are dry.
         meshes: Those of the arenas; None: there are none.
         who: (n,) whose image is rendered; the others' stays as it is.
         mount: The camera's place on the body.
@@ -195,10 +229,12 @@ def render_colour_images(
         cx: Column of the optical axis [px].
         cy: Row of the optical axis [px].
         cylindrical: The image is a cylinder's.
-        work: Room to work in, with the next three.
+        work: Room to work in, with the next four.
         rgb: (h, w, 3).
         depth: (h, w).
         seen: (h, w).
+        dry: (h, w, 3).
+        light_of: `image_sensor.LIGHT_OF`.
         patterns: `textures.atlas()`.
         bent: `fisheye.bent_of` the camera.
         out: (n, h, w, channels) sRGB, or grey where there is one channel, written.
@@ -238,6 +274,8 @@ def render_colour_images(
             patterns,
             bent,
         )
+        if rain is not None and rain.present[i] > 0:
+            draw_drops(image, dry, rain.drops[i, : rain.present[i]], light_of)
         if grey:
             pixels = rgb.shape[0] * rgb.shape[1]
             write_grey(out[i].reshape(pixels), rgb.reshape(pixels, 3))

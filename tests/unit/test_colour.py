@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from airl_mav.arena.appearance import FLOOR, OBSTACLE, TEXTURES, Drawn, linear_of, srgb_of
+from airl_mav.arena.appearance import FLOOR, OBSTACLE, TEXTURES, linear_of, srgb_of
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape
 from airl_mav.camera import primitives
@@ -343,9 +343,9 @@ def with_floor(scene: Arena, texture: str, size_m: float) -> Arena:
     )
     texture_[FLOOR], size[FLOOR], offset[FLOOR] = TEXTURES.index(texture), size_m, 0.0
     albedo[FLOOR] = [[0.0] * 3, [1.0] * 3]
-    scene.__dict__["look"] = Drawn(
-        replace(finish, texture=texture_, albedo=albedo, size_m=size, offset=offset),
-        scene.look.light,
+    scene.__dict__["look"] = replace(
+        scene.look,
+        finish=replace(finish, texture=texture_, albedo=albedo, size_m=size, offset=offset),
     )
     return scene
 
