@@ -40,6 +40,8 @@ def arena_table(arena: Arena, spec: ArenaSpec) -> Table:
     table.add_row("start from the south-west corner", f"{-b.north_min:g} N {-b.east_min:g} E m")
     table.add_row("static obstacles", _shapes(arena, moving=False))
     table.add_row("moving obstacles", _shapes(arena, moving=True))
+    if arena.clear is not None:
+        table.add_row("obstacles of glass", str(int(arena.clear.sum())))
     if arena.tours:
         speeds = ", ".join(f"{_speed_m_s(tour):.2f}" for tour in arena.tours)
         periods = ", ".join(f"{tour.times_s[-1]:.0f}" for tour in arena.tours)

@@ -317,15 +317,21 @@ def _arena_traces(arena: Arena, *, obstacles: bool = True) -> list[Trace]:
         traces.append(_mesh([body], low, "ground") | shades)
     if obstacles and arena.n_static:
         shown = drawn(arena.meshes, MOST_TRIANGLES)
-        still = [
-            body_mesh(arena.obstacles, i, arena.obstacles.center[i])
+        bodies = {
+            i: body_mesh(arena.obstacles, i, arena.obstacles.center[i])
             for i in range(arena.n_static)
             if arena.mesh_of(i) not in shown
-        ]
+        }
+        glass = [] if arena.clear is None else np.flatnonzero(arena.clear).tolist()
+        panes = [bodies.pop(i) for i in glass if i in bodies]
+        still = list(bodies.values())
         for each in shown:
             places, triangles = standing(each)
             still.append((_east_north_up(places), triangles.astype(np.int64)))
-        traces.append(_mesh(still, STILL_COLOUR, "obstacle"))
+        if still:
+            traces.append(_mesh(still, STILL_COLOUR, "obstacle"))
+        if panes:
+            traces.append(_mesh(panes, STILL_COLOUR, "glass", opacity=0.3))
     return traces
 
 

@@ -16,6 +16,7 @@ FLOWN, COMMANDED, DROP = (40, 104, 168), (214, 84, 10), (120, 128, 136)
 NOSE, BLADE = (214, 84, 10), (33, 38, 45)
 
 WALL_OPACITY = 0.25
+GLASS_OPACITY = 0.35
 
 OPEN = Bounds(-50.0, 50.0, -50.0, 50.0, 5.0)
 """The floor of a flight outside of all arenas: around its start."""

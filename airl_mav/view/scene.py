@@ -33,6 +33,7 @@ from airl_mav.view.look import (
     FIRST,
     FLOOR,
     FLOWN,
+    GLASS_OPACITY,
     GOAL,
     GRID,
     HILLS,
@@ -225,7 +226,8 @@ class FlightScene:
                 continue
             moves = i >= arena.n_static
             colour = MOVING if moves else arena.look.finish.colour(OBSTACLE + i)
-            node = self._obstacle(arena, i, colour)
+            glass = arena.clear is not None and bool(arena.clear[i])
+            node = self._obstacle(arena, i, colour, GLASS_OPACITY if glass else None)
             if moves:
                 self._movers.append(node)
 
@@ -270,17 +272,20 @@ class FlightScene:
             position=(0.0, 0.0, -0.02),
         )
 
-    def _obstacle(self, arena: Arena, i: int, colour: tuple[int, int, int]) -> Any:
+    def _obstacle(
+        self, arena: Arena, i: int, colour: tuple[int, int, int], opacity: float | None
+    ) -> Any:
         half, at = arena.obstacles.half_size[i].tolist(), tuple(arena.obstacles.center[i].tolist())
         name = f"/arena/obstacle/{i}"
         if arena.obstacles.shape[i] == Shape.BOX:
             turn = quat_from_euler(0.0, 0.0, float(arena.obstacles.yaw[i]))
             size = tuple(2.0 * extent for extent in half)
-            return self._add("box", name, color=colour, dimensions=size, position=at, wxyz=turn)
+            look = {"color": colour, "opacity": opacity}
+            return self._add("box", name, dimensions=size, position=at, wxyz=turn, **look)
+        look = {"color": colour, "opacity": opacity, "position": at}
         if arena.obstacles.shape[i] == Shape.SPHERE:
-            return self._add("icosphere", name, radius=half[0], color=colour, position=at)
-        round_ = {"radius": half[0], "height": 2.0 * half[2]}
-        return self._add("cylinder", name, color=colour, position=at, **round_)
+            return self._add("icosphere", name, radius=half[0], **look)
+        return self._add("cylinder", name, radius=half[0], height=2.0 * half[2], **look)
 
     def _build_vehicle(self, shape: VehicleShape) -> None:
         """Build the vehicle of its parts: a body, two arms, a nose, four rotors, a camera."""

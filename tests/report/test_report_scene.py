@@ -15,6 +15,7 @@ from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena, Shape
 from airl_mav.arena.ground import Ground
 from airl_mav.flight.judge import Outcome
+from airl_mav.profiles.appearance import Appearance
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.rehearsal.run_folder import LoadedRun, load
@@ -135,6 +136,26 @@ def test_the_view_has_the_triangles_of_meshes(demo: Demo, tmp_path: Path) -> Non
     drawn = np.stack([body["x"], body["y"], body["z"]], axis=1)
     np.testing.assert_allclose(drawn, places[:, [1, 0, 2]] * [1.0, 1.0, -1.0], atol=0.006)
     np.testing.assert_array_equal(np.stack([body[axis] for axis in "ijk"], axis=1), faces)
+
+
+def test_the_view_shows_through_glass(demo: Demo) -> None:
+    spec = load_profile("arenas", "static-obstacles", ArenaSpec)
+    look = Appearance.model_validate({"static": {"materials": ["glass", "brick"]}})
+    spec = spec.model_copy(update={"appearance": look})
+    arena = generate(spec, 3, name="glass", vehicle_width_m=0.55)
+    assert arena.clear is not None
+    run, _ = demo
+    flight = SceneFlight(run.episodes[0], run.trajectories[0], arena)
+    view = flight_view(flight, 5.0, 90.0)
+    glass, solid = trace(view, "glass"), trace(view, "obstacle")
+    assert glass["opacity"] < 0.5 < solid["opacity"]
+    shown = {True: glass, False: solid}
+    for clear, body in shown.items():
+        expected = [
+            len(body_mesh(arena.obstacles, i, arena.obstacles.center[i])[0])
+            for i in np.flatnonzero(arena.clear == clear).tolist()
+        ]
+        assert len(body["x"]) == sum(expected) > 0
 
 
 def test_the_view_has_hills_and_what_lies_on_them(demo: Demo) -> None:

@@ -17,6 +17,7 @@ from airl_mav.flight.judge import Outcome
 from airl_mav.flight.quality import measure_quality
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory
+from airl_mav.profiles.appearance import Appearance
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.report.forensics.camera_view import (
     PolicyCamera,
@@ -203,6 +204,37 @@ def test_what_stands_behind_something_nearer_is_hidden() -> None:
     assert crash(path, alone, "hit static-box-1", stamps_of(path, last_s=0.3))[0] == (
         "seen and flown into"
     )
+
+
+def of_glass(arena: Arena) -> Arena:
+    """The same arena, of whose obstacles the last one alone is of glass."""
+    look = Appearance.model_validate({"static": {"materials": ["glass"]}})
+    made = replace(arena, appearance=look)
+    made.__dict__["clear"] = np.arange(len(arena.obstacles)) == len(arena.obstacles) - 1
+    return made
+
+
+def test_glass_is_the_cause_where_depth_passes_through_it() -> None:
+    box = of_glass(arena_of((Shape.BOX, 9.3, 0.0, 1.0, 0.0)))
+    kind, words = crash(AHEAD, box, "hit static-box-0", stamps_of(AHEAD))
+    assert kind == "glass, which depth passes through"
+    assert words.startswith("static-box-0 is of glass; the camera measured through it. It lay 1.3")
+    # A colour camera sees it.
+    colours = replace(SIGHT, intrinsics=replace(SIGHT.intrinsics, kind="rgb"))
+    record = record_of(AHEAD, Outcome.COLLISION, "hit static-box-0")
+    seen = cause_of(Evidence(record, AHEAD, stamps_of(AHEAD), box, colours, hard_brakes), USUAL_RUN)
+    assert seen.kind == "seen and flown into"
+
+
+def test_nothing_is_hidden_behind_glass() -> None:
+    path = flight_of([(0.0, 0.0, 0.0), (2.0, 3.0, 4.0), (4.0, 8.2, 0.0)])
+    behind = (Shape.BOX, 9.3, 0.0, 0.8, 0.0), (Shape.BOX, 4.0, 0.0, 1.5, 0.0)
+    stamps = stamps_of(path, last_s=0.3)
+    assert crash(path, arena_of(*behind), "hit static-box-0", stamps)[0] == (
+        "hidden behind something nearer"
+    )
+    glass = of_glass(arena_of(*behind))
+    assert crash(path, glass, "hit static-box-0", stamps)[0] == "seen and flown into"
 
 
 def test_walls_have_a_place_too() -> None:

@@ -15,9 +15,13 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import Mount, camera_pose, render
 from airl_mav.control.attitude import heading_of
 from airl_mav.flight.trajectory import Trajectory, pose_at
+from airl_mav.profiles.appearance import DEFAULT
 from airl_mav.profiles.camera import Camera
 
 Floats = NDArray[np.float64]
+
+NOTHING_M = 1e-6
+"""Half extents of an obstacle that is not there [m]."""
 
 SAME_DEPTH_M = 1e-3
 """Two depths closer than this show the same thing."""
@@ -60,6 +64,17 @@ class ObstacleView:
     """Part of the picture that showed the obstacle, 0 to 1; None for a wall or the floor."""
     hidden: bool
     """The obstacle would have been in the picture, but something nearer covered all of it."""
+
+
+def passes_through(arena: Arena, i: int, camera: PolicyCamera) -> bool:
+    """Return whether obstacle i is of glass, and the camera measures through it."""
+    clear = _clear(arena, camera)
+    return clear is not None and bool(clear[i])
+
+
+def _clear(arena: Arena, camera: PolicyCamera) -> NDArray[np.bool_] | None:
+    """Return the obstacles (n,) that a camera sees nothing of; None: it sees all."""
+    return arena.clear if camera.intrinsics.kind == "depth" else None
 
 
 def heading_rad(quaternion: Floats) -> float:
@@ -137,14 +152,25 @@ def view_obstacle(
     spot = nearest_spot(arena.obstacles, i, centers_then[i], pose_at(path, hit_us)[0])
     offset = spot + (centers[i] - centers_then[i])[:2] - position[:2]
     eye, attitude = camera_pose(position, quaternion, camera.mount)
+    clear = _clear(arena, camera)
+    if passes_through(arena, i, camera):
+        distance = float(np.linalg.norm(offset))
+        return ObstacleView(distance, bearing(quaternion, offset), 0.0, hidden=False)
 
     def depth(
         keep: slice, meshes: tuple[PlacedMesh, ...], ground: Ground | None = None
     ) -> NDArray[np.float32]:
         """Return the depth image (h, w) of the arena with some of its obstacles only."""
-        o = arena.obstacles
-        some = Obstacles(o.shape[keep], o.center[keep], o.half_size[keep], o.yaw[keep])
-        bare = replace(arena, obstacles=some, tours=(), meshes=meshes, ground=ground)
+        o, half = arena.obstacles, arena.obstacles.half_size
+        if clear is not None:
+            # Without an extent nothing of it is seen, and all keep their numbers.
+            half = np.where(clear[:, None], NOTHING_M, half)
+        some = Obstacles(o.shape[keep], o.center[keep], half[keep], o.yaw[keep])
+        # What is left is as solid as it is seen, whichever look these would draw.
+        bare = replace(
+            arena, obstacles=some, tours=(), meshes=meshes, ground=ground, appearance=DEFAULT,
+            statics=None,
+        )  # fmt: skip
         return render(bare, centers[keep], camera.intrinsics, camera.range_m, eye, attitude)
 
     whole = depth(slice(None), arena.meshes, arena.ground)

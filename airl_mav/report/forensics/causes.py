@@ -71,11 +71,13 @@ def _cause_of_collision(flight: Evidence, crash: Collision) -> Cause:
         half_angle = flight.camera.half_angle_rad if flight.camera else math.pi
         aside = flight.camera.aside_rad if flight.camera else abs
         shown = crash.seen[-1] if crash.seen else aside(view.bearing_rad) <= half_angle
-        if not shown:
+        if crash.glass:
+            kind = "glass, which depth passes through"
+        elif not shown:
             kind = "hidden behind something nearer" if view.hidden else "hit out of the picture"
         else:
             kind = _seen(crash, view, flight.braking_m)
-        if len(crash.seen) > 1:
+        if len(crash.seen) > 1 and not crash.glass:
             sentences.append(
                 f"It was in {sum(crash.seen)} of the last {len(crash.seen)} frames used."
             )
@@ -114,6 +116,8 @@ def _where(crash: Collision, camera: PolicyCamera | None) -> str:
     if view.share is not None and view.share >= SEEN_SHARE:
         return f"On the last frame used, {crash.what} filled {view.share:.1%} of it: {place}."
     limit = math.degrees(camera.half_angle_rad)
+    if crash.glass:
+        return f"{crash.what} is of glass; the camera measured through it. It lay {place}."
     if view.hidden:
         return f"On the last frame used, {crash.what} was hidden by something nearer: {place}."
     if camera.aside_rad(view.bearing_rad) > camera.half_angle_rad:

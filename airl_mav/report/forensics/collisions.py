@@ -20,6 +20,7 @@ from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.report.forensics.camera_view import (
     ObstacleView,
     bearing,
+    passes_through,
     view_obstacle,
     view_wall,
 )
@@ -57,6 +58,8 @@ class Collision:
     """Speed at which the motors answered."""
     view: ObstacleView | None
     """Where the spot that was hit lay on that frame; None where arena or camera is not known."""
+    glass: bool
+    """It is of glass, and the camera measured through it."""
     seen: tuple[bool, ...]
     """Whether the obstacle was in the picture in each of the last frames decided on, old to new."""
 
@@ -95,6 +98,7 @@ def examine_collision(flight: Evidence) -> Collision | None:
     number = hit_number(record.reason, arena)
     before_s = blind_m = lag_s = lag_m = answer_m_s = view = None
     seen: tuple[bool, ...] = ()
+    glass = False
     decisions = decisions_in_effect(stamps, hit_us)
     if decisions.size:
         frames = stamps["capture_us"][decisions[-LOOK_BACK:]]
@@ -118,6 +122,7 @@ def examine_collision(flight: Evidence) -> Collision | None:
                     for frame in frames
                 ]
                 view = views[-1]
+                glass = passes_through(arena, number, camera)
                 seen = tuple((v.share or 0.0) >= SEEN_SHARE for v in views)
             elif "wall" in record.reason:
                 view = view_wall(path, frame_us, hit_us, arena)
@@ -131,5 +136,6 @@ def examine_collision(flight: Evidence) -> Collision | None:
         lag_m=lag_m,
         answer_m_s=answer_m_s,
         view=view,
+        glass=glass,
         seen=seen,
     )
