@@ -29,6 +29,7 @@ from airl_mav.report.forensics.camera_view import headings
 from airl_mav.report.forensics.worst import flown_path
 from airl_mav.report.run_figures import OUTCOME_COLOURS, speed_colours
 from airl_mav.report.table import OUTCOME_LABELS
+from airl_mav.view.look import GLASS_OPACITY
 
 POINTS = 240
 """A path has at most this many points: one a tenth of a second, or what is seen of more."""
@@ -331,7 +332,7 @@ def _arena_traces(arena: Arena, *, obstacles: bool = True) -> list[Trace]:
         if still:
             traces.append(_mesh(still, STILL_COLOUR, "obstacle"))
         if panes:
-            traces.append(_mesh(panes, STILL_COLOUR, "glass", opacity=0.3))
+            traces.append(_mesh(panes, STILL_COLOUR, "glass", opacity=GLASS_OPACITY))
     return traces
 
 

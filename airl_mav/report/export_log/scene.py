@@ -49,6 +49,7 @@ from airl_mav.view.look import (
     FIRST,
     FLOOR,
     FLOWN,
+    GLASS_OPACITY,
     GOAL,
     HILLS,
     LEAST_ARROW_M,
@@ -172,10 +173,11 @@ def obstacle(
     """Return obstacle i, whose centre (3,) NED [m] is there now."""
     half_size = arena.obstacles.half_size[i]
     yaw = quat_from_euler(0.0, 0.0, float(arena.obstacles.yaw[i]))
+    glass = arena.clear is not None and bool(arena.clear[i])
     look: dict[str, Any] = {
         "pose": pose(center, yaw),
         "size": vector(2.0 * half_size),
-        "color": colour(rgb),
+        "color": colour(rgb, GLASS_OPACITY if glass else 1.0),
     }
     entity: dict[str, Any] = {"timestamp": at, "frame_id": WORLD, "id": name}
     if arena.obstacles.shape[i] == Shape.BOX:
