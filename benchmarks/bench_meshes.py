@@ -94,7 +94,7 @@ def rates(
         bodies: tuple[Any, ...] = (*poses, *lens, arena.bounds.as_array())
         bodies += (o.shape, o.center, o.half_size, o.yaw, meshes_of(arena.meshes, len(o)))
         surfaces: tuple[Any, ...] = (look.texture, look.per_m, look.offset, look.albedo)
-        surfaces += (look.lights, atlas())
+        surfaces += (None, look.lights, atlas())
         calls.append((bodies, surfaces))
     last: tuple[Any, ...] = (bent_of(k),)
     best = np.full((len(arenas), 2), math.inf)
