@@ -96,9 +96,9 @@ _WAITING: Final = 48
 _ABOVE_M: Final = 5e-4
 """So far above a mesh begins a ray to the sun [m], as of `mesh_shadows`."""
 
-_RAY: Final = 11
+_RAY: Final = 12
 """Numbers of a ray that waits: origin, direction, share of red, green and blue, way so far, depth
-in the tree."""
+in the tree, `Seen.blur`."""
 
 
 @kernel
@@ -141,6 +141,8 @@ class Seen(NamedTuple):
     cosine: float
     """Of the angle between ray and normal, 0 to 1."""
     alpha: float
+    blur: float
+    """`alpha` of the roughest surface that has mirrored the ray before; 0: of none."""
 
 
 @large_kernel
@@ -182,7 +184,7 @@ def draw_reflections(
         per = 1.0 / math.sqrt(n * n + e * e + d * d)
         # By ways along oblique rays, where `Look.pixel2` is by depth.
         pixel2 = F32(look.pixel2 * per * per * per)
-        _wait(tree, 0, camera, (per * n, per * e, per * d), (1.0, 1.0, 1.0), 0.0, 0)
+        _wait(tree, 0, camera, (per * n, per * e, per * d), (1.0, 1.0, 1.0), 0.0, 0, 0.0)
         _follow(colour, tree, nodes, bodies, meshes, look, pixel2)
         out[u] = packed(F32(colour[0]), F32(colour[1]), F32(colour[2]))
 
@@ -196,19 +198,22 @@ def _wait(
     share: Vec,
     way: float,
     depth: int,
+    blur: float,
 ) -> None:
     """Note a ray that is to be followed."""
     for k in range(3):
         tree[at, k], tree[at, 3 + k], tree[at, 6 + k] = origin[k], ray[k], share[k]
-    tree[at, 9], tree[at, 10] = way, depth
+    tree[at, 9], tree[at, 10], tree[at, 11] = way, depth, blur
 
 
 @borrowing_kernel
-def _grown(tree: NDArray[np.float64], tops: int, seen: Seen, ray: Vec, share: Vec) -> int:
+def _grown(
+    tree: NDArray[np.float64], tops: int, seen: Seen, ray: Vec, share: Vec, blur: float
+) -> int:
     """Note a ray from a point that counts for something; return how many wait."""
     if max(max(share[0], share[1]), share[2]) < _COUNTS or tops == _WAITING:
         return tops
-    _wait(tree, tops, seen.at, ray, share, seen.way, seen.depth + 1)
+    _wait(tree, tops, seen.at, ray, share, seen.way, seen.depth + 1, max(seen.blur, blur))
     return tops + 1
 
 
@@ -248,7 +253,7 @@ def _follow(
         origin = (tree[tops, 0], tree[tops, 1], tree[tops, 2])
         ray = (tree[tops, 3], tree[tops, 4], tree[tops, 5])
         share = (tree[tops, 6], tree[tops, 7], tree[tops, 8])
-        way, depth = tree[tops, 9], int(tree[tops, 10])
+        way, depth, blur = tree[tops, 9], int(tree[tops, 10]), tree[tops, 11]
         met = meet(bodies, meshes, origin, ray, nodes)
         if met.seen == SKY:
             _add(colour, share, _sky(light, ray, origin[2]), 1.0)
@@ -267,7 +272,7 @@ def _follow(
         albedo = _albedo(look, row, bodies, met, place, meshes, ray, way, pixel2)
         seen = Seen(
             ray, share, way, depth, advanced(origin, ray, met.distance), place.normal, albedo,
-            min(max(-dot(place.normal, ray), 0.0), 1.0), float(look.gloss.alpha[row]),
+            min(max(-dot(place.normal, ray), 0.0), 1.0), float(look.gloss.alpha[row]), blur,
         )  # fmt: skip
         if kind == GLASS:
             tops = _pass(tree, tops, seen)
@@ -300,9 +305,9 @@ def _pass(tree: NDArray[np.float64], tops: int, seen: Seen) -> int:
     """Go on through a pane and back from it; return how many rays wait."""
     back = pane_reflects(seen.cosine)
     away = mirrored(seen.ray, seen.normal)
-    tops = _grown(tree, tops, seen, away, _scaled(seen.share, back))
+    tops = _grown(tree, tops, seen, away, _scaled(seen.share, back), 0.0)
     onwards = _times(_scaled(seen.share, 1.0 - back), seen.albedo)
-    return _grown(tree, tops, seen, seen.ray, onwards)
+    return _grown(tree, tops, seen, seen.ray, onwards, 0.0)
 
 
 @large_borrowing_kernel
@@ -328,10 +333,15 @@ def _scatter(
 
 @large_borrowing_kernel
 def _shine(colour: NDArray[np.float64], seen: Seen, kind: int, light: Lit, arrives: float) -> None:
-    """Add the sun's highlight on a rough surface; a mirror shows it as the point that it is."""
+    """Add the sun's highlight on a rough surface; a mirror shows it as the point that it is.
+
+    Mirrored by a rough surface it is as wide as that one's own: eight rays would show it eight
+    times (Kaplanyan and Dachsbacher, Path space regularization, 2013).
+    """
     if arrives == 0.0 or is_smooth(seen.alpha):
         return
-    value, cosine = highlight(seen.alpha, seen.normal, seen.ray, _sun(light))
+    alpha = max(seen.alpha, seen.blur)
+    value, cosine = highlight(alpha, seen.normal, seen.ray, _sun(light))
     if kind == METAL:
         _add(colour, _times(seen.share, seen.albedo), light.sun, arrives * value)
     else:
@@ -353,7 +363,7 @@ def _mirror(tree: NDArray[np.float64], tops: int, seen: Seen, kind: int) -> int:
             share = _times(share, seen.albedo)
         else:
             share = _scaled(share, fresnel(min(max(-dot(shine, seen.ray), 0.0), 1.0)))
-        tops = _grown(tree, tops, seen, away, share)
+        tops = _grown(tree, tops, seen, away, share, 0.0 if many == 1 else seen.alpha)
     return tops
 
 
