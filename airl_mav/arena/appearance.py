@@ -263,8 +263,11 @@ def _light(appearance: Appearance, draw: int) -> Light:
 
 def _drops(appearance: Appearance, draw: int) -> NDArray[np.float32]:
     """Draw the drops of rain on the lens, drop by drop."""
-    rain, rng = appearance.rain, stream(draw, Stream.APPEARANCE, _Part.RAIN)
+    rain = appearance.rain
     least, most = rain.drops
+    if not most:
+        return np.zeros((0, 4), np.float32)
+    rng = stream(draw, Stream.APPEARANCE, _Part.RAIN)
     wet, number = rng.random() < rain.share, rng.integers(least, most, endpoint=True)
     draws = rng.random((int(number) if wet else 0, 4))
     (narrow, wide), (round_, long) = rain.size, rain.streak

@@ -22,8 +22,9 @@ from airl_mav.camera.mesh_surfaces import shade_meshes
 from airl_mav.camera.mesh_triangles import Faces
 from airl_mav.camera.primitives import FLOOR, GROUND, OBSTACLE, SKY, Ids, Rectangles
 from airl_mav.camera.projection import MIN_DEPTH_M, Bent, Pose, View
+from airl_mav.camera.ray_ends import Look
 from airl_mav.camera.raycast import aim, blank, draw_bodies, invert
-from airl_mav.camera.reflections import Look, draw_reflections
+from airl_mav.camera.reflections import draw_reflections
 from airl_mav.camera.shading import F32, ZERO, Lit, Packed, Plane, Points, Rays, surface_of
 from airl_mav.camera.shadows import CORNERS, shade_by_obstacle, shade_by_walls
 from airl_mav.camera.surfaces import (

@@ -14,6 +14,26 @@ from airl_mav.vehicle.rotation import Vec
 
 
 @borrowing_kernel
+def _through(boxes: NDArray[np.float32], node: int, at: Vec, inverse: Vec) -> tuple[float, float]:
+    """Return where a ray enters and leaves a node's box; it leaves before it enters: never.
+
+    Args:
+        boxes: `Bvh.boxes`.
+        node: Which one.
+        at: (3,) where the ray begins.
+        inverse: (3,) one over each of its components.
+    """
+    i0, i1, i2 = inverse
+    a, b, c = (
+        (boxes[node, 0] - at[0]) * i0,
+        (boxes[node, 1] - at[1]) * i1,
+        (boxes[node, 2] - at[2]) * i2,
+    )
+    w0, w1, w2 = boxes[node, 3] * abs(i0), boxes[node, 4] * abs(i1), boxes[node, 5] * abs(i2)
+    return max(max(a - w0, b - w1), c - w2), min(min(a + w0, b + w1), c + w2)
+
+
+@borrowing_kernel
 def stopped_by(
     bvh: Bvh,
     root: int,
@@ -38,19 +58,10 @@ def stopped_by(
     """
     if last >= 0 and _stops(bvh.corners, last, at, sun, least):
         return last
-    i0, i1, i2 = inverse
-    v0, v1, v2 = abs(i0), abs(i1), abs(i2)
     boxes, links = bvh.boxes, bvh.links
     tops, node = 0, root
     while True:
-        a, b, c = (
-            (boxes[node, 0] - at[0]) * i0,
-            (boxes[node, 1] - at[1]) * i1,
-            (boxes[node, 2] - at[2]) * i2,
-        )
-        w0, w1, w2 = boxes[node, 3] * v0, boxes[node, 4] * v1, boxes[node, 5] * v2
-        enter = max(max(a - w0, b - w1), c - w2)
-        leave = min(min(a + w0, b + w1), c + w2)
+        enter, leave = _through(boxes, node, at, inverse)
         if leave >= max(enter, least):
             count = links[node, 1]
             if count == 0:
@@ -89,19 +100,11 @@ def distance_to(
         most: Nor do those that are farther than this.
         waiting: (STACK,) room to work in.
     """
-    i0, i1, i2 = inverse_of(way[0]), inverse_of(way[1]), inverse_of(way[2])
-    v0, v1, v2 = abs(i0), abs(i1), abs(i2)
+    inverse = (inverse_of(way[0]), inverse_of(way[1]), inverse_of(way[2]))
     boxes, links = bvh.boxes, bvh.links
     tops, node, best, which = 0, root, most, -1
     while True:
-        a, b, c = (
-            (boxes[node, 0] - at[0]) * i0,
-            (boxes[node, 1] - at[1]) * i1,
-            (boxes[node, 2] - at[2]) * i2,
-        )
-        w0, w1, w2 = boxes[node, 3] * v0, boxes[node, 4] * v1, boxes[node, 5] * v2
-        enter = max(max(a - w0, b - w1), c - w2)
-        leave = min(min(a + w0, b + w1), c + w2)
+        enter, leave = _through(boxes, node, at, inverse)
         if leave >= max(enter, least) and enter <= best:
             count = links[node, 1]
             if count == 0:

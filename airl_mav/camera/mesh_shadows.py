@@ -23,7 +23,7 @@ from airl_mav.camera.shadows import along32, ray32, shadow_rectangle, start32, w
 from airl_mav.core.kernels import large_borrowing_kernel, large_kernel
 from airl_mav.vehicle.rotation import Vec
 
-_ABOVE_M: Final = 5e-4
+ABOVE_M: Final = 5e-4
 """So far above the surface that is seen, and no nearer to its own, a ray begins [m]."""
 
 _WIDER_M: Final = 1e-4
@@ -121,7 +121,7 @@ def _shade_by_mesh(
     inverse = (inverse_of(sun[0]), inverse_of(sun[1]), inverse_of(sun[2]))
     own = np.int32(OBSTACLE + meshes.first[k])
     f, d, along = pose.forward, pose.across, along32(pose)
-    above, last = per * _ABOVE_M, -1
+    above, last = per * ABOVE_M, -1
     # First which points may be hidden, in float32 and so many at a time.
     c0, c1, c2 = F32(middle[0]), F32(middle[1]), F32(middle[2])
     per32 = F32(per)

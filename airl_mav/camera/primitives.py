@@ -63,7 +63,7 @@ def _slab(low: float, high: float) -> _Slab:
 
 
 @kernel
-def _turn(v: Vec, cos: float, sin: float) -> Vec:
+def turn_axes(v: Vec, cos: float, sin: float) -> Vec:
     """Return a world vector along axes that are turned about the vertical."""
     return (cos * v[0] + sin * v[1], cos * v[1] - sin * v[0], v[2])
 
@@ -328,8 +328,8 @@ def draw_sphere(
 def turned(pose: Pose, cos: float, sin: float) -> Pose:
     """Return a pose in the world along axes that are turned about the vertical."""
     return Pose(
-        _turn(pose.forward, cos, sin),
-        _turn(pose.across, cos, sin),
-        _turn(pose.along, cos, sin),
-        _turn(pose.center, cos, sin),
+        turn_axes(pose.forward, cos, sin),
+        turn_axes(pose.across, cos, sin),
+        turn_axes(pose.along, cos, sin),
+        turn_axes(pose.center, cos, sin),
     )

@@ -27,6 +27,7 @@ from airl_mav.camera.primitives import (
     SKY,
     WALL_EAST_WEST,
     WALL_NORTH_SOUTH,
+    turn_axes,
 )
 from airl_mav.camera.projection import dot
 from airl_mav.core.kernels import borrowing_kernel, kernel, large_borrowing_kernel
@@ -103,12 +104,6 @@ def advanced(origin: Vec, ray: Vec, distance: float) -> Vec:
     )
 
 
-@kernel
-def _turned(v: Vec, cos: float, sin: float) -> Vec:
-    """Return a vector along axes that are turned about the vertical."""
-    return (cos * v[0] + sin * v[1], cos * v[1] - sin * v[0], v[2])
-
-
 @large_borrowing_kernel
 def _span(bodies: Bodies, i: int, origin: Vec, ray: Vec) -> tuple[float, float]:
     """Return where a ray enters an obstacle and leaves it; it leaves before it enters: never."""
@@ -119,7 +114,7 @@ def _span(bodies: Bodies, i: int, origin: Vec, ray: Vec) -> tuple[float, float]:
     if apart > 0.0 and (ahead > 0.0 or ahead * ahead < apart):
         return math.inf, -math.inf
     cos, sin = bodies.turn[i, 0], bodies.turn[i, 1]
-    o, d = _turned(away, cos, sin), _turned(ray, cos, sin)
+    o, d = turn_axes(away, cos, sin), turn_axes(ray, cos, sin)
     if bodies.shape[i] == BOX:
         i0, i1, i2 = inverse_of(d[0]), inverse_of(d[1]), inverse_of(d[2])
         a, b, c = -o[0] * i0, -o[1] * i1, -o[2] * i2
@@ -175,7 +170,7 @@ def _from_mesh(meshes: Meshes, k: int, origin: Vec, ray: Vec) -> tuple[Vec, Vec]
         per * (origin[1] - meshes.pose[k, 1]),
         per * (origin[2] - meshes.pose[k, 5]),
     )
-    return _turned(offset, cos, sin), _turned(ray, cos, sin)
+    return turn_axes(offset, cos, sin), turn_axes(ray, cos, sin)
 
 
 @large_borrowing_kernel
@@ -250,7 +245,7 @@ def _on_mesh(meshes: Meshes, met: Met, p: Vec, ray: Vec) -> Place:
     k, n = met.mesh, meshes.bvh.normals[met.face]
     scale, cos, sin = meshes.pose[k, 4], meshes.pose[k, 2], meshes.pose[k, 3]
     at, _ = _from_mesh(meshes, k, p, ray)
-    normal = _turned((float(n[0]), float(n[1]), float(n[2])), cos, -sin)
+    normal = turn_axes((float(n[0]), float(n[1]), float(n[2])), cos, -sin)
     return Place((scale * at[0], scale * at[1], scale * at[2]), _towards(normal, ray), 3)
 
 
@@ -259,7 +254,7 @@ def _on_obstacle(bodies: Bodies, i: int, p: Vec, ray: Vec) -> Place:
     """Return where on obstacle i the point p lies."""
     center, half = bodies.center[i], bodies.half_size[i]
     cos, sin = bodies.turn[i, 0], bodies.turn[i, 1]
-    a, b, c = _turned((p[0] - center[0], p[1] - center[1], p[2] - center[2]), cos, sin)
+    a, b, c = turn_axes((p[0] - center[0], p[1] - center[1], p[2] - center[2]), cos, sin)
     side = 3
     if bodies.shape[i] == BOX:
         qa, qb, qc = abs(a) / half[0], abs(b) / half[1], abs(c) / half[2]
@@ -274,7 +269,7 @@ def _on_obstacle(bodies: Bodies, i: int, p: Vec, ray: Vec) -> Place:
         per = 1.0 / max(math.sqrt(a * a + b * b + height * height), 1e-9)
         normal = (per * a, per * b, per * height)
     # Inside glass the far side is seen from within.
-    return Place((a, b, c), _towards(_turned(normal, cos, -sin), ray), side)
+    return Place((a, b, c), _towards(turn_axes(normal, cos, -sin), ray), side)
 
 
 @large_borrowing_kernel
