@@ -58,5 +58,11 @@ class RateDemand(NamedTuple):
     """Collective 0..1."""
 
 
+KIND_US = 500_000
+"""PX4 follows another kind of offboard setpoint at the next publication of its control mode: twice
+a second, counted from the last change of its status, as the switch to Offboard is one [µs]. Until
+then it flies the last of the kind before. Source: PX4 1.16, Commander::run (vehicle_control_mode);
+measured: from velocities to body rates it took 0.5 s."""
+
 AnyDemand = Demand | TrajectoryDemand | AttitudeDemand | RateDemand
 """What `Controller.fly` takes."""

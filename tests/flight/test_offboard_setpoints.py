@@ -7,7 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from airl_mav.control.demand import AttitudeDemand, RateDemand
+from airl_mav.control.demand import KIND_US, AttitudeDemand, RateDemand
+from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.frames import quat_yaw
 from firmware_sim.autopilot.autopilot_state import Mode, Setpoint
 from tests.support.flight_rig import NAN, Rig, flight, velocity_setpoint
@@ -17,11 +18,16 @@ STILL = velocity_setpoint(0.0, 0.0, 0.0)
 
 
 def attitude(rig: Rig, demand: AttitudeDemand | RateDemand, seconds: float) -> None:
-    """Command an attitude or rates at 20 Hz."""
+    """Command an attitude or rates at 20 Hz, once its kind is followed: before that the same thrust
+    without tilt or turn."""
     rig.stream(None)
-    for _ in range(round(seconds * 20.0)):
-        rig.ap.offer_attitude(demand, rig.sim.time_us)
-        rig.run(0.05)
+    level = RateDemand((0.0, 0.0, 0.0), demand.thrust)
+    if isinstance(demand, AttitudeDemand):
+        level = AttitudeDemand((1.0, 0.0, 0.0, 0.0), 0.0, demand.thrust)
+    for wanted, time_s in ((level, KIND_US / US_PER_S), (demand, seconds)):
+        for _ in range(round(time_s * 20.0)):
+            rig.ap.offer_attitude(wanted, rig.sim.time_us)
+            rig.run(0.05)
 
 
 def settle(rig: Rig) -> None:
@@ -75,3 +81,36 @@ def test_every_kind_of_setpoint() -> None:
             rig.run(0.05)
         assert rig.ap.flight.mode is Mode.POSITION
         assert rig.said("Offboard setpoints refused: SET_POSITION_TARGET_LOCAL_NED invalid") > 0.0
+
+
+def test_another_kind_of_setpoint_is_followed_half_a_second_later() -> None:
+    """As PX4 follows it, which publishes its control mode twice a second: measured."""
+    turn = RateDemand((0.0, 0.0, 1.0), 0.5)
+    with flight(0) as rig:
+        rig.take_off(5.0, settle_s=0.5)
+        rig.go_offboard(STILL)
+        rig.stream(None)
+        asked_us = rig.sim.time_us
+        while rig.ap.state().rate_setpoint[2] != 1.0:
+            rig.ap.offer_attitude(turn, rig.sim.time_us)
+            rig.run(TICK_US / US_PER_S)
+        # Its mode was published right now: that is when it is looked at, and not before.
+        assert rig.sim.time_us - asked_us <= KIND_US + TICK_US
+        rig.stream(STILL)
+        rig.run(0.45)
+        turning = [rig.truth.angular_velocity[2]]
+        rig.run(3.0)
+        turning.append(rig.truth.angular_velocity[2])
+        assert turning == pytest.approx([1.0, 0.0], abs=0.15)
+
+
+def test_entering_offboard_follows_the_newest_kind_at_once() -> None:
+    turn = RateDemand((0.0, 0.0, 1.0), 0.5)
+    with flight(0) as rig:
+        rig.take_off(5.0, settle_s=0.5)
+        rig.ap.offer_attitude(turn, rig.sim.time_us)
+        rig.ap.set_mode(Mode.OFFBOARD)
+        for _ in range(20):
+            rig.ap.offer_attitude(turn, rig.sim.time_us)
+            rig.run(0.01)
+        assert rig.truth.angular_velocity[2] > 0.3

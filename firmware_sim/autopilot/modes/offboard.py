@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from airl_mav.control.demand import (
+    KIND_US,
     AnyDemand,
     AttitudeDemand,
     Demand,
@@ -37,6 +38,10 @@ class Offboard(FlightMode):
         self._waiting = Hold(context)
         self._setpoint: Setpoint | AttitudeDemand | RateDemand | None = None
         self._flown: AnyDemand | None = None
+        self._followed: AnyDemand | None = None
+        """The newest of the kind that is followed now."""
+        self._kind_us = 0
+        """When the kind is looked at next [µs]."""
 
     @property
     def lifts(self) -> bool:
@@ -54,12 +59,19 @@ class Offboard(FlightMode):
     def enter(self, state: Vector, _request: Request | None, /) -> None:
         """Begin."""
         self._waiting.enter(state, None)
+        self._kind_us = 0
 
     def demand(self, state: Vector, time_us: int, /) -> AnyDemand:
         """Return what the companion commands."""
         demand = self._newest()
         if demand is None:
             return self._waiting.demand(state, time_us)
+        if time_us >= self._kind_us:
+            self._kind_us, self._followed = time_us + KIND_US, demand
+        elif _kind(demand) is _kind(self._followed):
+            self._followed = demand
+        elif self._followed is not None:
+            demand = self._followed
         if isinstance(demand, RateDemand) and math.isnan(demand.rates[2]):
             # No yaw rate is commanded: it stays what it is.
             roll, pitch, _ = demand.rates
@@ -73,6 +85,11 @@ class Offboard(FlightMode):
             self._setpoint = setpoint
             self._flown = demand_of(setpoint) if isinstance(setpoint, Setpoint) else setpoint
         return self._flown
+
+
+def _kind(demand: AnyDemand | None) -> type[AnyDemand]:
+    """Return what kind of setpoint a demand is of: positions and velocities are one."""
+    return type(demand) if isinstance(demand, AttitudeDemand | RateDemand) else Demand
 
 
 def demand_of(setpoint: Setpoint) -> Demand | TrajectoryDemand:
