@@ -157,7 +157,7 @@ def time_decisions(mission: Mission, seen: ReceivedFrame, state: Kinematics) -> 
     told = InFlight.of_first_decisions(1)
     observation = observe(
         *(frame.image, frame.intrinsics, state, np.asarray(mission.goal, np.float64)),
-        InFlight(told.command[0], told.latency_s[0], told.age_s[0]),
+        InFlight(told.latency_s[0], told.age_s[0], told.setpoint[0]),
         further=views_of(frame),
     )
     try:
@@ -172,7 +172,7 @@ def time_decisions(mission: Mission, seen: ReceivedFrame, state: Kinematics) -> 
     del took_us[0]
     median_us = float(np.median(took_us))
     longest_s = max(took_us) / US_PER_S
-    bound_s = mission.watchdog.decision_timeout_s
+    bound_s = mission.watchdog.timeout_s()
     return Finding(
         "decision",
         longest_s < bound_s,

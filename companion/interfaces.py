@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, TypeAlias
 
+from airl_mav.policy.actions import Attitude, BodyRates
 from airl_mav.policy.observation import Kinematics
 
 LINK_LOST = "link lost"
@@ -56,6 +57,9 @@ class BodyVelocity(NamedTuple):
 
 STOP = BodyVelocity(0.0, 0.0, 0.0, 0.0)
 
+Setpoint: TypeAlias = "BodyVelocity | Attitude | BodyRates"
+"""What is sent: four numbers each."""
+
 
 class Link(Protocol):
     """What the pilot needs of a flight controller. Calls raise LinkError when refused."""
@@ -73,8 +77,8 @@ class Link(Protocol):
         """Return who flies."""
         ...
 
-    def set_velocity_body(self, setpoint: BodyVelocity) -> None:
-        """Send a velocity setpoint; it is repeated until the next one."""
+    def send_setpoint(self, setpoint: Setpoint) -> None:
+        """Send a setpoint; it is repeated until the next one, of whatever kind."""
         ...
 
     def release(self) -> None:

@@ -17,15 +17,24 @@ import numpy as np
 from mavsdk import ComponentType
 from mavsdk.plugins.action import Action, ActionError
 from mavsdk.plugins.mavlink_direct import MavlinkDirect, MavlinkDirectError, MavlinkMessage
-from mavsdk.plugins.offboard import Offboard, OffboardError, VelocityBodyYawspeed
+from mavsdk.plugins.offboard import Attitude as OffboardAttitude
+from mavsdk.plugins.offboard import AttitudeRate, Offboard, OffboardError, VelocityBodyYawspeed
 from mavsdk.plugins.server_utility import ServerUtility, StatusTextType
 from mavsdk.plugins.telemetry import FlightMode, Telemetry, TelemetryError, TelemetryResult
 
 from airl_mav.core.clock import Clock, WallClock
 from airl_mav.core.constants import US_PER_S
+from airl_mav.policy.actions import Attitude
 from airl_mav.policy.observation import Kinematics
 from companion.dialects import POSITION, PX4, Dialect, dialect_of
-from companion.interfaces import STOP, BatteryState, BodyVelocity, LinkError, VehicleStatus
+from companion.interfaces import (
+    STOP,
+    BatteryState,
+    BodyVelocity,
+    LinkError,
+    Setpoint,
+    VehicleStatus,
+)
 from companion.mavsdk_connection import exchange_raw, first_autopilot, open_connection, set_timeout
 
 POLL_S = 0.1
@@ -230,14 +239,16 @@ class MavsdkLink:
         return bool(self._telemetry.armed())
 
     def kinematics(self) -> Kinematics:
-        """Return the newest position, velocity and attitude."""
+        """Return the newest position, velocity, attitude and body rates."""
         pv = self._telemetry.position_velocity_ned()
         q = self._telemetry.attitude_quaternion()
+        w = self._telemetry.attitude_angular_velocity_body()
         p, v = pv.position, pv.velocity
         return Kinematics(
             np.array([p.north_m, p.east_m, p.down_m]),
             np.array([v.north_m_s, v.east_m_s, v.down_m_s]),
             np.array([q.w, q.x, q.y, q.z]),
+            np.array([w.roll_rad_s, w.pitch_rad_s, w.yaw_rad_s]),
         )
 
     def status(self) -> VehicleStatus:
@@ -327,7 +338,7 @@ class MavsdkLink:
 
     def enter_offboard(self) -> None:
         """Send a zero setpoint and switch to offboard; return when setpoints take effect."""
-        self.set_velocity_body(STOP)
+        self.send_setpoint(STOP)
         self._call("offboard", self._offboard.start)
         self._pause(OFFBOARD_SETTLE_S)
 
@@ -339,7 +350,7 @@ class MavsdkLink:
         """
         while not self._flies_offboard():
             self._check(None, stop=stop)
-            self.set_velocity_body(STOP)
+            self.send_setpoint(STOP)
             self._pause(OFFBOARD_REPEAT_S)
 
     def _flies_offboard(self) -> bool:
@@ -371,14 +382,22 @@ class MavsdkLink:
             self._direct = MavlinkDirect(self._system)
         self._direct.subscribe_message(name, heard)
 
-    def set_velocity_body(self, setpoint: BodyVelocity) -> None:
-        """Send a velocity setpoint; MAVSDK repeats it at 20 Hz until the next one."""
+    def send_setpoint(self, setpoint: Setpoint) -> None:
+        """Send a setpoint; MAVSDK repeats it at 20 Hz until the next one, of whatever kind."""
         self.setpoints_sent += 1
-        *velocity, yaw_rate_rad_s = setpoint
+        offboard = self._offboard
         try:
-            self._offboard.set_velocity_body(
-                VelocityBodyYawspeed(*velocity, math.degrees(yaw_rate_rad_s))
-            )
+            # MAVSDK takes angles in degrees.
+            if isinstance(setpoint, BodyVelocity):
+                *velocity, yaw_rate = setpoint
+                offboard.set_velocity_body(VelocityBodyYawspeed(*velocity, math.degrees(yaw_rate)))
+                return
+            *angles, thrust = setpoint
+            degrees = map(math.degrees, angles)
+            if isinstance(setpoint, Attitude):
+                offboard.set_attitude(OffboardAttitude(*degrees, thrust))
+            else:
+                offboard.set_attitude_rate(AttitudeRate(*degrees, thrust))
         except OffboardError as error:
             raise LinkError(f"setpoint refused: {_reason(error)}") from None
 

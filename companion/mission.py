@@ -19,6 +19,7 @@ from airl_mav.prediction.compensator import Compensator
 from airl_mav.scenario.model import LimitSettings, PilotSettings, WatchdogSettings
 from airl_mav.scenario.stand_alone import Start
 from companion.camera import FrameSource
+from companion.dialects import ARDUPILOT
 from companion.guard import Guard
 from companion.interfaces import CAMERA_SILENT, LINK_LOST, STOP, TELEMETRY_FROZEN, LinkError
 from companion.limits import NOT_OURS, Limits
@@ -147,7 +148,7 @@ def fly_mission(
                 _land(link, left, progress)
             elif navigating and not left:
                 progress("handing back")
-                link.set_velocity_body(STOP)
+                link.send_setpoint(STOP)
                 link.leave_offboard()
     except LinkError as error:
         notes.append(str(error))
@@ -168,6 +169,10 @@ def _begin(
     """Return once the vehicle flies our setpoints. Raises LinkError."""
     progress("arming" if start == "arm" else "waiting for offboard")
     link.prepare(PREPARE_TIMEOUT_S, stop)
+    if settings.commands != "velocity" and link.dialect is ARDUPILOT:
+        # Its GUIDED mode takes a thrust for a climb rate, unless GUID_OPTIONS says otherwise.
+        words = settings.commands.replace("_", " ")
+        raise LinkError(f"the policy commands {words}, which only PX4 flies with its thrust")
     if start == "offboard":
         link.await_offboard(stop)
         return
@@ -180,7 +185,7 @@ def _begin(
 def _land(link: MavsdkLink, left_offboard: bool, progress: Callable[[str], None]) -> None:
     progress("landing")
     if not left_offboard:
-        link.set_velocity_body(STOP)
+        link.send_setpoint(STOP)
     link.land(LAND_TIMEOUT_S)
 
 

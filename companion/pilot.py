@@ -21,14 +21,14 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.core.goals import Goal, goal_distance_m
 from airl_mav.latency.samplers import LatencySampler
 from airl_mav.latency.stamps import NO_STAMP, DecisionLog
-from airl_mav.policy.actions import Policy, limited, vertical_speed
+from airl_mav.policy.actions import Action, AnyAction, Policy, flyable, vertical_speed
 from airl_mav.policy.observation import InFlight, Kinematics, Observation, observe, views_of
 from airl_mav.policy.observation_spec import MOST_FRAMES
 from airl_mav.prediction.compensator import Compensator
 from airl_mav.prediction.memory import DecisionMemory
 from airl_mav.scenario.model import PilotSettings
 from companion.camera import FrameSource, ReceivedFrame
-from companion.interfaces import BodyVelocity, Link
+from companion.interfaces import BodyVelocity, Link, Setpoint
 from companion.limits import Limits
 from companion.watchdog import Watchdog
 
@@ -51,7 +51,7 @@ class Decided(NamedTuple):
     seen: ReceivedFrame
     state: Kinematics
     """What telemetry said when it began."""
-    setpoint: BodyVelocity
+    setpoint: Setpoint
     started_us: int
     ready_us: int
     sent_us: int
@@ -94,12 +94,13 @@ class Pilot:
         default_factory=lambda: deque(maxlen=MOST_FRAMES - 1), init=False
     )
     """What further cameras showed them, by name."""
-    log: DecisionLog = field(default_factory=DecisionLog, init=False)
+    log: DecisionLog = field(init=False)
     held_us: int = field(default=NO_STAMP, init=False)
     """When the last hold ended."""
 
     def __post_init__(self) -> None:
         """Keep account of the decisions: the compensator's, where there is one."""
+        self.log = DecisionLog(commands=self.settings.commands)
         compensator = self.compensator
         self.memory = DecisionMemory(1) if compensator is None else compensator.memory
 
@@ -158,16 +159,12 @@ class Pilot:
         lasts_us = None if self.latency is None else self.latency.sample_us()
         started_us = clock.time_us()
         observation = self._observe(seen, state, goal, started_us)
-        action = limited(self.policy.act(observation), settings.max_speed_m_s)
+        action = flyable(self.policy.act(observation), settings.commands, settings.max_speed_m_s)
         if lasts_us is not None:
             # Not to be interrupted: a computation is not.
             clock.sleep_until(started_us + lasts_us)
         ready_us = clock.time_us()
-        down = action.down_m_s
-        if down is None:
-            # The vertical speed holds the altitude.
-            down = vertical_speed(settings.altitude_m, float(self.link.kinematics().position[2]))
-        setpoint = BodyVelocity(action.forward_m_s, action.right_m_s, down, action.yaw_rate_rad_s)
+        setpoint = self._setpoint(action)
         hold_us = int(settings.hold_s * US_PER_S)
         sent_us = clock.time_us()
         if stop.is_set():
@@ -213,6 +210,17 @@ class Pilot:
         )
         return None
 
+    def _setpoint(self, action: AnyAction) -> Setpoint:
+        """Return what is sent for an action."""
+        if not isinstance(action, Action):
+            return action
+        down = action.down_m_s
+        if down is None:
+            # The vertical speed holds the altitude.
+            now_m = float(self.link.kinematics().position[2])
+            down = vertical_speed(self.settings.altitude_m, now_m)
+        return BodyVelocity(action.forward_m_s, action.right_m_s, down, action.yaw_rate_rad_s)
+
     def _observe(
         self, seen: ReceivedFrame, state: Kinematics, goal: Goal, now_us: int
     ) -> Observation:
@@ -236,7 +244,7 @@ class Pilot:
         self.further.appendleft({name: each.image for name, each in views.items()})
         return observe(
             *(image, frame.intrinsics, state, np.asarray(goal, np.float64)),
-            InFlight(told.command[0], told.latency_s[0], told.age_s[0]),
+            InFlight(told.latency_s[0], told.age_s[0], told.setpoint[0]),
             earlier,
             views,
         )

@@ -17,8 +17,9 @@ import threading
 
 from airl_mav.core.clock import Clock
 from airl_mav.core.constants import US_PER_S
+from airl_mav.policy.actions import Attitude, BodyRates
 from airl_mav.scenario.model import WatchdogSettings
-from companion.interfaces import STOP, BodyVelocity, Link, LinkError
+from companion.interfaces import STOP, Link, LinkError, Setpoint
 
 
 class Watchdog:
@@ -42,6 +43,7 @@ class Watchdog:
         self._fed_us = clock.time_us()
         self._hover_us: int | None = None
         self._stopped = False
+        self._last: Setpoint = STOP
 
     def begin(self) -> None:
         """The pilot takes over: the first decision is due."""
@@ -51,7 +53,7 @@ class Watchdog:
         """Say what the pilot is at: it names the culprit when a decision is overdue."""
         self._activity = activity
 
-    def command(self, setpoint: BodyVelocity, hold_us: int) -> bool:
+    def command(self, setpoint: Setpoint, hold_us: int) -> bool:
         """Send a decided setpoint, meant to hold for so long [µs].
 
         False when offboard has been left and it is too late.
@@ -59,7 +61,8 @@ class Watchdog:
         with self._lock:
             if self.left_offboard:
                 return False
-            self._link.set_velocity_body(setpoint)
+            self._link.send_setpoint(setpoint)
+            self._last = setpoint
             self._fed_us = self._clock.time_us()
             self._stopped = False
             hover_s = self._settings.hover_after_s
@@ -99,16 +102,27 @@ class Watchdog:
                     self._stopped = True
                     self._hover_us = None
                     self._note("velocity zeroed", now_us)
-                    self._link.set_velocity_body(STOP)
+                    self._stop()
                 elif self._hover_us is not None and now_us >= self._hover_us:
                     self._hover_us = None
-                    self._link.set_velocity_body(STOP)
+                    self._stop()
             except LinkError as error:
                 self._note(str(error), now_us)
 
+    def _stop(self) -> None:
+        """Have the flight controller hold the vehicle where it is."""
+        last = self._last
+        # PX4 flies a velocity after body rates, or an attitude, up to half a second later, and the
+        # last of those until then: it must neither turn on, nor lean.
+        if isinstance(last, BodyRates):
+            self._link.send_setpoint(BodyRates(0.0, 0.0, 0.0, last.thrust))
+        elif isinstance(last, Attitude):
+            self._link.send_setpoint(Attitude(0.0, 0.0, last.yaw_rad, last.thrust))
+        self._link.send_setpoint(STOP)
+
     @property
     def _overdue_us(self) -> int:
-        return self._fed_us + int(self._settings.decision_timeout_s * US_PER_S)
+        return self._fed_us + int(self._settings.timeout_s() * US_PER_S)
 
     @property
     def _leave_us(self) -> int:

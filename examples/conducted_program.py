@@ -16,7 +16,7 @@ with Stage() as stage:
         stage.link.arm(20.0, stage.abandon)
         stage.link.takeoff(2.5, 30.0, stage.abandon)
         stage.link.enter_offboard()
-        stage.link.set_velocity_body(BodyVelocity(2.0, 0.0, 0.0, 0.0))
+        stage.link.send_setpoint(BodyVelocity(2.0, 0.0, 0.0, 0.0))
         stage.clock.sleep_until(stage.clock.time_us() + 5_000_000)
         stage.link.land(60.0)
 

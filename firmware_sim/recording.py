@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.flight.trajectory import TrajectoryRecorder
+from airl_mav.latency.stamps import NO_STAMP
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
-from firmware_sim.autopilot.autopilot_state import Estimate, Setpoint
+from firmware_sim.autopilot.autopilot_state import Estimate, Wire
 from firmware_sim.faults.timeline import Acted
 from firmware_sim.plant.kinematics import POSE
 from firmware_sim.plant.plant import Plant
@@ -26,10 +27,12 @@ class SetpointLog:
         time passes while it is read.
         """
         self._read_by = read_by
-        self._accepted: list[tuple[int, tuple[float, float, float, float]]] = []
+        self._accepted: list[tuple[int, Wire]] = []
         self._motor_us: list[int] = []
+        """`NO_STAMP` of those that are not flown yet."""
         self._under_way: list[list[int]] = []
-        """How many setpoints were taken in a tick, and after how many more they are flown."""
+        """First and last setpoint that were taken in a tick, and after how many more they are
+        flown: of body rates that is sooner than of a velocity that came before them."""
         self._taken = 0
 
     @property
@@ -40,34 +43,38 @@ class SetpointLog:
     @property
     def pending(self) -> bool:
         """Whether setpoints were accepted that no motor commands reflect yet."""
-        return len(self._accepted) > len(self._motor_us)
+        return bool(self._under_way) or self.fresh
 
-    def accepted(self, setpoint: Setpoint, time_us: int) -> None:
+    def accepted(self, setpoint: Wire, time_us: int) -> None:
         """Note an accepted setpoint, read from `time_us` on [µs]."""
         if self._read_by is not None:
             time_us = self._read_by(time_us)
-        self._accepted.append((time_us, setpoint.wire))
+        self._accepted.append((time_us, setpoint))
+        self._motor_us.append(NO_STAMP)
 
     def take(self, ticks_to_motors: int) -> None:
         """Note that the coming tick takes what was accepted, to be flown so many ticks later."""
-        self._under_way.append([len(self._accepted) - self._taken, ticks_to_motors])
+        self._under_way.append([self._taken, len(self._accepted), ticks_to_motors])
         self._taken = len(self._accepted)
 
     def ticked(self, time_us: int) -> None:
         """Note that motor commands were computed, at `time_us` [µs]."""
         for entry in self._under_way:
-            if entry[1] <= 0:
-                self._motor_us.extend([time_us] * entry[0])
-            entry[1] -= 1
-        self._under_way = [entry for entry in self._under_way if entry[1] >= 0]
+            first, end, ticks = entry
+            if ticks <= 0:
+                self._motor_us[first:end] = [time_us] * (end - first)
+            entry[2] -= 1
+        self._under_way = [entry for entry in self._under_way if entry[2] >= 0]
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return accepted_us (n,), motor_us (n,), setpoint float32 (n, 4)."""
-        n = len(self._motor_us)
+        motor_us = np.array(self._motor_us, np.int64)
+        flown = motor_us != NO_STAMP
+        wires = np.array([wire for _, wire in self._accepted], np.float32).reshape(-1, 4)
         return {
-            "accepted_us": np.array([t for t, _ in self._accepted[:n]], np.int64),
-            "motor_us": np.array(self._motor_us, np.int64),
-            "setpoint": np.array([v for _, v in self._accepted[:n]], np.float32).reshape(n, 4),
+            "accepted_us": np.array([t for t, _ in self._accepted], np.int64)[flown],
+            "motor_us": motor_us[flown],
+            "setpoint": wires[flown],
         }
 
 

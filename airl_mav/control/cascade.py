@@ -250,7 +250,7 @@ def hand_over(wanted: Vec, thrust_sp: float, first: bool, memory: Memory) -> tup
 def _skip_position_loop(velocity: Vec, memory: Memory, weights: Filters, dt: float) -> None:
     """Keep the velocity's filter going while no position is flown."""
     if memory[WAIT] == 0.0:
-        _differentiate(velocity, memory, weights, POSITION_TICKS * dt)
+        differentiate(velocity, memory, weights, POSITION_TICKS * dt)
         memory[WAIT] = POSITION_TICKS
     memory[WAIT] -= 1.0
     for i in range(3):
@@ -289,7 +289,7 @@ def position_loop(
 ) -> None:
     """Publish the attitude and thrust that fly the demand."""
     period = POSITION_TICKS * dt
-    _differentiate(velocity, memory, weights, period)
+    differentiate(velocity, memory, weights, period)
     velocity_sp = velocity_setpoint(position, demand.position, demand.velocity, gains)
     thrust, integral = velocity_control(
         velocity,
@@ -315,7 +315,7 @@ def _trajectory_loop(
 ) -> None:
     """As `position_loop`, with an acceleration."""
     period = POSITION_TICKS * dt
-    _differentiate(velocity, memory, weights, period)
+    differentiate(velocity, memory, weights, period)
     north, east, down = velocity_setpoint(position, demand.position, demand.velocity, gains)
     if math.isnan(demand.position[2]) and math.isnan(demand.velocity[2]):
         down = math.nan
@@ -333,7 +333,7 @@ def _trajectory_loop(
 
 
 @kernel
-def _differentiate(velocity: Vec, memory: Memory, weights: Filters, period: float) -> None:
+def differentiate(velocity: Vec, memory: Memory, weights: Filters, period: float) -> None:
     """Advance the filtered derivative of the velocity."""
     velocities = (velocity[0], velocity[1], velocity[2])
     for i in range(3):

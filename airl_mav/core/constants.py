@@ -54,3 +54,5 @@ MAX_ATTEMPTS: Final = 3
 """A job or a flight whose processes are lost is begun so many times, the first included."""
 Level = Literal["gym", "lockstep", "sitl", "hil", "firmware", "flight"]
 """What flew, as a report calls it: a rung of the fidelity ladder."""
+CommandKind = Literal["velocity", "attitude", "body_rates"]
+"""What a policy commands: all actions of one are of one kind."""

@@ -38,7 +38,7 @@ def frd_to_flu(v: Vector) -> Vector:
 
 
 def quat_multiply(a: Vector, b: Vector) -> Vector:
-    """Return the Hamilton product a ⊗ b of two quaternions (4,)."""
+    """Return the Hamilton product a ⊗ b of two quaternions (4,), or of n pairs (4, n)."""
     w1, x1, y1, z1 = a
     w2, x2, y2, z2 = b
     return np.array(
@@ -110,6 +110,15 @@ def quats_to_euler(q: Vector) -> tuple[Vector, Vector, Vector]:
     pitch = np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0))
     yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
     return roll, pitch, yaw
+
+
+def down_in_body(roll: Vector, pitch: Vector) -> Vector:
+    """Return where down is (..., 3), in body axes FRD, of vehicles with roll and pitch (...) [rad].
+
+    The last row of the rotation matrix body -> NED.
+    """
+    level = np.cos(pitch)
+    return np.stack([-np.sin(pitch), np.sin(roll) * level, np.cos(roll) * level], axis=-1)
 
 
 def quat_yaw(q: Vector) -> float:

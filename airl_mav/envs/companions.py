@@ -93,7 +93,7 @@ class Companions:
         """
         if self._compensator is not None:
             image, state = self._image, self._state
-        states = zip(vars(self._states).values(), vars(state).values(), strict=True)
+        states = zip(self._states.known().values(), state.known().values(), strict=True)
         others = ((kept, further[name]) for name, kept in self._further.items())
         for kept, new in ((self._earlier, image), *states, *others):
             if len(kept):
@@ -110,7 +110,7 @@ class Companions:
         """Take the setpoints that all have sent.
 
         Args:
-            setpoints: (n, 4) forward, right, down [m/s], yaw rate [rad/s].
+            setpoints: (n, 4) as `Fleet.setpoint`.
             t2_us: What the decisions took.
             sent_us: When they were sent.
             stop_us: When each is replaced by a stop if no other has come; None: never.
@@ -147,7 +147,7 @@ class Companions:
             np.flatnonzero(who), image, self._age_us, now_us, state
         )
         self._image[who] = foreseen[who]
-        for kept, found in zip(vars(self._state).values(), vars(then).values(), strict=True):
+        for kept, found in zip(self._state.known().values(), then.known().values(), strict=True):
             kept[who] = found[who]
 
     def foreseen(self, rows: Rows) -> tuple[NDArray[Any], Kinematics]:
@@ -160,7 +160,7 @@ class Companions:
 
     def earlier(self, rows: Rows) -> Earlier:
         """Return what the decisions before saw, and in what states, the newest first."""
-        kept = (self._earlier, *vars(self._states).values())
+        kept = (self._earlier, *self._states.known().values())
         return [
             (each[0][rows], Kinematics(*each[1:]).rows(rows)) for each in zip(*kept, strict=True)
         ]
@@ -178,12 +178,12 @@ class Companions:
         """Return by name all arrays that change, for checkpoints."""
         held: dict[str, Any] = {}
         if self.remember:
-            held["earlier"] = {"depth_mm": self._earlier, **vars(self._states)}
+            held["earlier"] = {"depth_mm": self._earlier, **self._states.known()}
             kept = {name: each for name, each in self._further.items() if len(each)}
             if kept:
                 held["earlier_further"] = kept
         if self._compensator is not None:
-            foreseen = {"depth_mm": self._image, **vars(self._state)}
+            foreseen = {"depth_mm": self._image, **self._state.known()}
             held["compensator"] = {**self._compensator.held(), "foreseen": foreseen}
         if self._memory is not None:
             held["decisions"] = {**self._memory.held(), "age_us": self._age_us}

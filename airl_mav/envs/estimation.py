@@ -146,11 +146,12 @@ class Telemetry(Stateful):
         self._errors = step_errors(self._model, self._errors, normals, flown_s)
 
     def report(self, truth: Kinematics, rows: Rows) -> Kinematics:
-        """Return the states of `rows` as telemetry reports them."""
+        """Return the states of `rows` as telemetry reports them; body rates have no error."""
         if self._model is None:
             return truth
         errors = self._errors[rows]
-        return Kinematics(*perturbed(truth.position, truth.velocity, truth.quaternion, errors))
+        told = perturbed(truth.position, truth.velocity, truth.quaternion, errors)
+        return Kinematics(*told, truth.rates)
 
     def position(self, truth: Array) -> Array:
         """Return the positions (n, 3) of all n as telemetry reports them; see `report`."""

@@ -10,13 +10,14 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.core.constants import CommandKind
 from airl_mav.core.errors import UsageError
 from airl_mav.envs.fleet import Verdict
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.flight.judge import Outcome
-from airl_mav.policy.action_sets import commands, commands_vertical_speed
-from airl_mav.policy.actions import Policy, limited
+from airl_mav.policy.action_sets import command_numbers, commands
+from airl_mav.policy.actions import Action, Policy, flyable
 from airl_mav.policy.layouts import encode_layout
 from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.policy.observation import Observation
@@ -94,8 +95,7 @@ class LearnedPilots:
         try:
             if not self._alone:
                 return commands(card.actions, self._policy.act_batch(encoded))
-            columns = 4 if commands_vertical_speed(card.actions) else 3
-            chosen = np.zeros((len(flying), columns))
+            chosen = np.zeros((len(flying), command_numbers(card.actions)))
             for i in np.flatnonzero(flying):
                 row = {key: array[i : i + 1] for key, array in encoded.items()}
                 chosen[i] = commands(card.actions, self._own[int(i)].act_batch(row))[0]
@@ -107,10 +107,16 @@ class LearnedPilots:
 class SinglePilots:
     """One policy object per vehicle, new with each episode: for policies with a memory."""
 
-    def __init__(self, make: Callable[[], Policy], max_speed_m_s: float) -> None:
-        """Take the policy's factory, and the speed limit of its actions [m/s]."""
+    def __init__(
+        self,
+        make: Callable[[], Policy],
+        max_speed_m_s: float,
+        commands: CommandKind = "velocity",
+    ) -> None:
+        """Take the policy's factory, the speed limit of its actions [m/s], and what it commands."""
         self._make = make
         self._max_speed_m_s = max_speed_m_s
+        self._commands: CommandKind = commands
         self._policies: dict[int, Policy] = {}
 
     def begin(self, slot: int, seed: int) -> None:  # noqa: ARG002
@@ -121,7 +127,11 @@ class SinglePilots:
         """Return the commands; see `Pilots`."""
         chosen = np.tile((0.0, 0.0, 0.0, math.nan), (len(flying), 1))
         for i in np.flatnonzero(flying):
-            action = limited(self._policies[int(i)].act(seen.rows(int(i))), self._max_speed_m_s)
+            asked = self._policies[int(i)].act(seen.rows(int(i)))
+            action = flyable(asked, self._commands, self._max_speed_m_s)
+            if not isinstance(action, Action):
+                chosen[i] = action
+                continue
             chosen[i, :3] = action.forward_m_s, action.right_m_s, action.yaw_rate_rad_s
             if action.down_m_s is not None:
                 chosen[i, 3] = action.down_m_s

@@ -22,7 +22,7 @@ from airl_mav.envs.planner import Planner
 from airl_mav.envs.saved_state import State, Stateful
 from airl_mav.envs.spec import ExpertName
 from airl_mav.policy.action_sets import (
-    CONTINUOUS,
+    VELOCITIES,
     VERTICAL,
     ActionSpec,
     commands,
@@ -55,8 +55,8 @@ def choices(spec: ActionSpec) -> Choices:
     if spec.set in VERTICAL:
         accepted = "one without a vertical speed; with one, expert gates"
         raise FieldError("environment.actions", spec.set, accepted)
-    if count is None and spec.set not in CONTINUOUS:
-        accepted = f"a discrete action set, or {' or '.join(map(repr, CONTINUOUS))}"
+    if count is None and spec.set not in VELOCITIES:
+        accepted = f"a discrete action set, or {' or '.join(map(repr, VELOCITIES))}"
         raise FieldError("environment.actions", spec.set, accepted)
     if count is not None:
         actions: NDArray[Any] = np.arange(count)

@@ -56,7 +56,8 @@ class Fleet(NamedTuple):
     rotor: NDArray[np.float64]  # (n, 4) speeds, fraction of full
     felt: NDArray[np.float64]  # (n, 3) acceleration NED as the power model takes it [m/s²]
     memory: NDArray[np.float64]  # (n, MEMORY_SIZE) of the cascade
-    setpoint: NDArray[np.float64]  # (n, 4) forward, right, down [m/s], yaw rate [rad/s]
+    setpoint: NDArray[np.float64]  # (n, 4) forward, right, down [m/s], yaw rate [rad/s]; or, ...
+    by_rates: NDArray[np.bool_]  # (n,) ... body rates FRD [rad/s] and thrust 0..1
     velocity_ned: NDArray[np.float64]  # (n, 3) the setpoint as PX4 holds it
     repeat_us: NDArray[np.int64]  # (n,) time of the next repeat
     distance: NDArray[np.float64]  # (n,) flown since the start [m]
@@ -131,6 +132,7 @@ def new_fleet(n: int) -> Fleet:
         felt=np.zeros((n, 3)),
         memory=new_memory(n),
         setpoint=np.zeros((n, 4)),
+        by_rates=np.zeros(n, np.bool_),
         velocity_ned=np.zeros((n, 3)),
         repeat_us=np.zeros(n, np.int64),
         distance=np.zeros(n),

@@ -21,6 +21,7 @@ from airl_mav.control.cascade import (
     POSITION_TICKS,
     Filters,
     attitude_sp,
+    differentiate,
     filters,
     hand_over,
     position_loop,
@@ -29,7 +30,17 @@ from airl_mav.control.cascade import (
 )
 from airl_mav.control.demand import Demand
 from airl_mav.control.gains import Gains
-from airl_mav.control.memory import MEMORY_SIZE, SAT, WAIT
+from airl_mav.control.memory import (
+    ATTITUDE_SP,
+    MEMORY_SIZE,
+    RATES_SP,
+    SAT,
+    THRUST_ON,
+    THRUST_SP,
+    VELOCITY_SP,
+    WAIT,
+    YAW_RATE_SP,
+)
 from airl_mav.control.mixer import allocate, desaturate
 from airl_mav.core.constants import TICK_S, TICK_US
 from airl_mav.core.kernels import kernel
@@ -41,6 +52,7 @@ from airl_mav.envs.lanes import (
     AIRFRAME_SIZE,
     ATTITUDE,
     BATTERY,
+    BY_RATES,
     COLLECTIVE,
     DISTANCE,
     ENERGY,
@@ -145,8 +157,12 @@ def advance(
                     _repeat(fleet, i, state, j)
                 if air is not None:
                     _blow(air[i], fleet.time_us[i], state, j)
-        _outer_loops(state, spare, who, aloft, vehicle.gains, weights)
+        by_rates = _outer_loops(state, spare, who, aloft, vehicle.gains, weights)
+        if by_rates:
+            _prepare_rates(state, who)
         _inner_loops(state, who, vehicle.gains, weights)
+        if by_rates:
+            _keep_rates(state, who)
         odd ^= 1
         _move(state, vehicle, kept)
         for j in range(LANES):
@@ -234,7 +250,15 @@ def _next(
 
 @kernel
 def _repeat(fleet: Fleet, i: int, state: State, j: int) -> None:
-    """Turn the setpoint of vehicle i, in lane j, into NED by the present heading."""
+    """Turn the setpoint of vehicle i, in lane j, into NED by the present heading.
+
+    Body rates stay what they are.
+    """
+    if fleet.by_rates[i]:
+        for axis in range(3):
+            state[WANTED + axis, j] = fleet.setpoint[i, axis]
+        fleet.repeat_us[i] += REPEAT_US
+        return
     c, s = heading_of(quat(state, ATTITUDE, j))
     forward, right = fleet.setpoint[i, 0], fleet.setpoint[i, 1]
     fleet.velocity_ned[i, 0] = c * forward - s * right
@@ -261,7 +285,7 @@ def _outer_loops(
     aloft: int,
     gains: Gains,
     weights: Filters,
-) -> None:
+) -> bool:
     """Run the first half of `cascade_tick` in every lane: to what the attitude loop flies.
 
     Args:
@@ -271,17 +295,22 @@ def _outer_loops(
         aloft: In how many lanes somebody is.
         gains: Gains and limits.
         weights: `filters(gains, TICK_S)`.
+
+    Returns:
+        Whether body rates are commanded in any lane; there nothing is run but a filter.
     """
-    due = 0
+    due, by_rates = 0, 0
     for j in range(LANES):
         memory = state[MEMORY:ROWS, j]
+        by_rates += who[j] != _NOBODY and state[BY_RATES, j] != 0.0
         first = start(vec(state, VELOCITY, j), vec(state, RATES, j), memory, weights)
         state[FIRST, j] = 1.0 if first else 0.0
         due += who[j] != _NOBODY and memory[WAIT] == 0.0
         _publish(state, j)
     if due > 0:
         # In all lanes, or none would be fast; those that are not due keep what they had.
-        if due < aloft:
+        kept = due < aloft or by_rates > 0
+        if kept:
             spare[:] = state[MEMORY:ROWS]
         for j in range(LANES):
             demand = Demand(NAN3, vec(state, WANTED, j), math.nan, state[YAW_RATE, j])
@@ -289,12 +318,18 @@ def _outer_loops(
             position_loop(p, v, q, demand, state[MEMORY:ROWS, j], gains, weights, TICK_S)
         for j in range(LANES):
             if state[MEMORY + WAIT, j] != 0.0:
-                if due < aloft:
+                if kept:
                     state[MEMORY:ROWS, j] = spare[:, j]
+            elif state[BY_RATES, j] != 0.0:
+                state[MEMORY:ROWS, j] = spare[:, j]
+                velocity, period = vec(state, VELOCITY, j), POSITION_TICKS * TICK_S
+                differentiate(velocity, state[MEMORY:ROWS, j], weights, period)
+                state[MEMORY + WAIT, j] = POSITION_TICKS
             else:
                 state[MEMORY + WAIT, j] = POSITION_TICKS
                 if state[FIRST, j] != 0.0:
                     _publish(state, j)
+    return by_rates > 0
 
 
 @kernel
@@ -335,6 +370,34 @@ def _inner_loops(state: State, who: NDArray[np.int64], gains: Gains, weights: Fi
                 state[MEMORY + SAT + axis, j] = missing[axis]
             for k in range(4):
                 state[MOTORS + k, j] = motors[k]
+
+
+@kernel
+def _prepare_rates(state: State, who: NDArray[np.int64]) -> None:
+    """Have the rate loop fly what is commanded, where body rates are, as `rate_tick` does.
+
+    It flies what the attitude loop has published before: here that is the command.
+    """
+    for j in range(LANES):
+        if who[j] != _NOBODY and state[BY_RATES, j] != 0.0:
+            for axis in range(3):
+                state[MEMORY + RATES_SP + axis, j] = state[WANTED + axis, j]
+            state[MEMORY + THRUST_ON, j] = state[YAW_RATE, j]
+            state[FIRST, j] = 0.0
+
+
+@kernel
+def _keep_rates(state: State, who: NDArray[np.int64]) -> None:
+    """Leave the memory as `rate_tick` does, where body rates are commanded."""
+    for j in range(LANES):
+        if who[j] != _NOBODY and state[BY_RATES, j] != 0.0:
+            for axis in range(3):
+                state[MEMORY + RATES_SP + axis, j] = state[WANTED + axis, j]
+                state[MEMORY + VELOCITY_SP + axis, j] = math.nan
+            for k in range(4):
+                state[MEMORY + ATTITUDE_SP + k, j] = state[ATTITUDE + k, j]
+            state[MEMORY + YAW_RATE_SP, j] = 0.0
+            state[MEMORY + THRUST_SP, j] = state[MEMORY + THRUST_ON, j] = state[YAW_RATE, j]
 
 
 @kernel

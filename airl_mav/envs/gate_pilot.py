@@ -20,7 +20,7 @@ from airl_mav.arena.geometry import Arena
 from airl_mav.core.errors import FieldError
 from airl_mav.core.frames import ned_to_heading, quats_to_euler
 from airl_mav.envs.navigation import Navigation
-from airl_mav.policy.action_sets import CONTINUOUS, VERTICAL
+from airl_mav.policy.action_sets import VELOCITIES, VERTICAL
 from airl_mav.policy.actions import fastest_climb
 
 AHEAD_S = 0.4
@@ -52,8 +52,8 @@ class GatePilot:
             FieldError: The action set has no vertical speed, or is a discrete one.
         """
         actions = navigation.spec.action_spec
-        if actions.set not in CONTINUOUS or actions.set not in VERTICAL:
-            accepted = ", ".join(name for name in CONTINUOUS if name in VERTICAL)
+        if actions.set not in VELOCITIES or actions.set not in VERTICAL:
+            accepted = ", ".join(name for name in VELOCITIES if name in VERTICAL)
             raise FieldError("environment.actions", actions.set, f"{accepted} with expert gates")
         self._navigation = navigation
         self._speed, self._climb = actions.max_speed_m_s, fastest_climb(actions.max_speed_m_s)

@@ -37,7 +37,8 @@ PUBLISHED, PUBLISHED_YAW_RATE, PUBLISHED_THRUST = 33, 37, 38  # what the attitud
 REDUCED, HALF_TURN = 39, 43  # of the attitude loop
 TORQUE, COLLECTIVE, MOTORS = 44, 47, 48  # of the rate loop
 FITS = 52  # 1: no motor command is out of range
-AIRFRAME = 53
+BY_RATES = 53  # 1: `WANTED` holds body rates [rad/s], and `YAW_RATE` the thrust
+AIRFRAME = 54
 AIRFRAME_SIZE = len(Airframe._fields)
 MEMORY = AIRFRAME + AIRFRAME_SIZE
 ROWS = MEMORY + MEMORY_SIZE
@@ -63,11 +64,14 @@ def load(fleet: Fleet, i: int, state: State, j: int) -> None:
         state[VELOCITY + axis, j] = fleet.velocity[i, axis]
         state[RATES + axis, j] = fleet.omega[i, axis]
         state[FELT + axis, j] = fleet.felt[i, axis]
-        state[WANTED + axis, j] = fleet.velocity_ned[i, axis]
+        by_rates = fleet.by_rates[i]
+        state[WANTED + axis, j] = (
+            fleet.setpoint[i, axis] if by_rates else fleet.velocity_ned[i, axis]
+        )
     for k in range(4):
         state[ATTITUDE + k, j] = fleet.quaternion[i, k]
         state[ROTOR + k, j] = fleet.rotor[i, k]
-    state[YAW_RATE, j] = fleet.setpoint[i, 3]
+    state[YAW_RATE, j], state[BY_RATES, j] = fleet.setpoint[i, 3], fleet.by_rates[i]
     state[ENERGY, j] = fleet.energy[i]
     state[BATTERY, j] = fleet.battery[i]
     state[DISTANCE, j] = fleet.distance[i]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from airl_mav.core.kernels import kernel
 from airl_mav.envs.fleet import Fleet
-from airl_mav.envs.lanes import ATTITUDE, POSITION, YAW_RATE, State
+from airl_mav.envs.lanes import ATTITUDE, BY_RATES, POSITION, YAW_RATE, State
 
 
 class Legs(NamedTuple):
@@ -21,6 +21,7 @@ class Legs(NamedTuple):
 
     ticks: NDArray[np.int64]  # (n, 3) how long each one is
     setpoint: NDArray[np.float64]  # (n, 4) taken at the end of the first, as `Fleet.setpoint`
+    by_rates: NDArray[np.bool_]  # (n,) as `Fleet.by_rates`
     # Kept at the end of the second, or where the flight ends before it:
     seen_us: NDArray[np.int64]  # (n,) the time
     seen_position: NDArray[np.float64]  # (n, 3) NED [m]
@@ -44,7 +45,9 @@ def next_leg(
         if leg == 0:
             for axis in range(4):
                 fleet.setpoint[i, axis] = legs.setpoint[i, axis]
-            state[YAW_RATE, j], fleet.repeat_us[i] = fleet.setpoint[i, 3], fleet.time_us[i]
+            fleet.by_rates[i] = legs.by_rates[i]
+            state[YAW_RATE, j], state[BY_RATES, j] = fleet.setpoint[i, 3], fleet.by_rates[i]
+            fleet.repeat_us[i] = fleet.time_us[i]
         else:
             legs.seen_us[i] = fleet.time_us[i]
             for axis in range(3):

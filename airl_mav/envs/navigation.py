@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.core.constants import TICK_US, US_PER_MS, US_PER_S
+from airl_mav.core.constants import TICK_US, US_PER_MS, US_PER_S, CommandKind
 from airl_mav.core.errors import FieldError
 from airl_mav.core.streams import Stream, stream
 from airl_mav.envs.arenas import ArenaBatch, move_all_obstacles
@@ -45,7 +45,13 @@ from airl_mav.envs.legs import Legs
 from airl_mav.envs.saved_state import State, Stateful
 from airl_mav.envs.sight import check_conditions, sight_of
 from airl_mav.envs.spec import EnvironmentSpec
-from airl_mav.envs.timing import PipelinedTiming, SequentialTiming, give, ticks_of
+from airl_mav.envs.timing import (
+    RATES_FOLLOWED_US,
+    PipelinedTiming,
+    SequentialTiming,
+    give,
+    ticks_of,
+)
 from airl_mav.envs.trace import Trace
 from airl_mav.envs.winds import Winds
 from airl_mav.faults.model import Fault
@@ -122,6 +128,7 @@ class Navigation(Stateful):
         battery_charge: float = 1.0,
         compensator: Compensator | None = None,
         faults: Sequence[Fault] = (),
+        commands: CommandKind | None = None,
     ) -> None:
         """Load the profiles.
 
@@ -141,6 +148,8 @@ class Navigation(Stateful):
                 where `spec` compensates.
             faults: What happens in every flight, of what the twin has (`envs.faults`); no part of
                 a saved state.
+            commands: What `fly` is given, velocity or body_rates; None: what the actions of `spec`
+                command.
 
         Raises:
             UsageError: A profile cannot be used, or the camera does not serve the layout; a fault
@@ -148,6 +157,8 @@ class Navigation(Stateful):
         """
         self.spec = spec
         self.n = n
+        self.by_rates: bool = (commands or spec.action_spec.commands) == "body_rates"
+        """Whether body rates and thrusts are commanded, and not velocities."""
         if vehicle is None:
             vehicle, computer = equipped(spec.vehicle, spec.delay.computer, Payload())
             computer_w = computer.onboard_watts
@@ -338,8 +349,8 @@ class Navigation(Stateful):
     def truth(self, rows: Rows = EVERYONE) -> Kinematics:
         """Return the true state of all n; a copy."""
         fleet = self.fleet
-        state = Kinematics(fleet.position, fleet.velocity, fleet.quaternion).rows(rows)
-        return Kinematics(*map(np.copy, (state.position, state.velocity, state.quaternion)))
+        state = (fleet.position, fleet.velocity, fleet.quaternion, fleet.omega)
+        return Kinematics(*(np.array(each[rows]) for each in state))
 
     def whole_truth(self) -> WholeTruth:
         """Return all that the twin knows, the very arrays that it flies on: to look at only."""
@@ -350,17 +361,21 @@ class Navigation(Stateful):
 
         Args:
             commands: (n, 3) forward, right [m/s], yaw rate [rad/s]: an altitude is held; or
-                (n, 4): behind them the downward speed [m/s], NaN where the altitude is held.
+                (n, 4): behind them the downward speed [m/s], NaN where the altitude is held. Or,
+                `by_rates`, (n, 4) body rates FRD [rad/s] and thrust 0..1.
 
         Raises:
             ValueError: Not n commands.
         """
-        if commands.ndim != 2 or len(commands) != self.n or commands.shape[1] not in (3, 4):
-            accepted = f"({self.n}, 3) or ({self.n}, 4)"
+        least = 4 if self.by_rates else 3
+        if commands.ndim != 2 or len(commands) != self.n or not least <= commands.shape[1] <= 4:
+            accepted = " or ".join(f"({self.n}, {width})" for width in range(least, 5))
             raise ValueError(f"commands of shape {commands.shape}: accepted: {accepted}")
         # NaN: decided when it is sent.
         down = commands[:, 3] if commands.shape[1] == 4 else math.nan
         setpoints = np.insert(commands[:, :3], 2, down, axis=1)
+        if self.by_rates:
+            setpoints = np.array(commands)
         if self._trace is not None:
             self._trace.deciding(self.fleet)
         began_us = self.fleet.time_us.copy()
@@ -391,6 +406,8 @@ class Navigation(Stateful):
             self._companions.look_ahead(who, self.cameras.image, now_us, state)
 
     def _held(self) -> Mapping[str, Any]:
+        # What a checkpoint of before there were body rates does not have is not in one without.
+        unsaved = ("room",) if self.by_rates else ("room", "by_rates")
         held: dict[str, Any] = {
             "navigation": {
                 "seeds": self.seeds,
@@ -400,7 +417,7 @@ class Navigation(Stateful):
                 "extra_us": self._extra_us,
             },
             # Its room is looked for anew.
-            "fleet": {k: v for k, v in self.fleet._asdict().items() if k != "room"},
+            "fleet": {k: v for k, v in self.fleet._asdict().items() if k not in unsaved},
             "delays": self._delays,
             "telemetry": self._telemetry,
             "cameras": self.cameras,
@@ -448,10 +465,15 @@ class Navigation(Stateful):
             return False
         fleet = self.fleet
         # Those that do not fly take both where they are.
-        give(fleet, setpoints, fleet.verdict != Verdict.FLYING)
+        give(fleet, setpoints, fleet.verdict != Verdict.FLYING, by_rates=self.by_rates)
+        by_rates = np.full(self.n, self.by_rates)
+        if self.by_rates:
+            by_rates &= fleet.time_us + TICK_US * ticks[:, 0] >= RATES_FOLLOWED_US
+            setpoints = np.where(by_rates[:, None], setpoints, 0.0)
         legs = Legs(
             ticks,
             setpoints,
+            by_rates,
             fleet.time_us.copy(),
             fleet.position.copy(),
             fleet.quaternion.copy(),

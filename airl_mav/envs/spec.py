@@ -14,7 +14,14 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import Each, ProfileModel, later_field, quantity, validated
 from airl_mav.core.plugins import REWARDS, part_name
 from airl_mav.flight.judge import GOAL_RADIUS_M, TIME_LIMIT_S, GoalRadius, TimeLimit
-from airl_mav.policy.action_sets import PAPER_SPEED_M_S, ActionSetName, ActionSpec
+from airl_mav.policy.action_sets import (
+    BODY_RATES,
+    MAX_RATE_DEG_S,
+    PAPER_SPEED_M_S,
+    ActionSetName,
+    ActionSpec,
+    MaxRate,
+)
 from airl_mav.policy.actions import DecisionTiming
 from airl_mav.policy.observation_spec import (
     LEAST_ROWS,
@@ -279,16 +286,18 @@ class EnvironmentSpec(ProfileModel):
     )
     frames: Frames = 1
     in_flight: tuple[Told, ...] = Field(
-        default=(), description="what else the network is told: command, latency, age"
+        default=(),
+        description="what else the network is told: command, latency, age, setpoint, tilt, rates",
     )
     goal_height: GoalHeight = False
     actions: ActionSetName = Field(
         default="arc-25",
         description="action set: arc-25, paper-25, velocity, velocity-fixed-yaw; with a vertical"
-        " speed arc3d-75, velocity3d, velocity3d-fixed-yaw; or your own as MODULE:NAME or"
-        " FILE.py:NAME",
+        " speed arc3d-75, velocity3d, velocity3d-fixed-yaw; body-rates, with a thrust; or your own"
+        " as MODULE:NAME or FILE.py:NAME",
     )
     max_speed_m_s: float = quantity("fastest action", "m/s", gt=0, le=30, default=PAPER_SPEED_M_S)
+    max_rate_deg_s: MaxRate = later_field(MAX_RATE_DEG_S)
     reward: RewardName = Field(
         default="shaped",
         description="reward: shaped, timed, paper-scaled, paper, or your own as MODULE:NAME or"
@@ -357,6 +366,23 @@ class EnvironmentSpec(ProfileModel):
         return self
 
     @model_validator(mode="after")
+    def _commands_body_rates(self) -> EnvironmentSpec:
+        if self.actions != BODY_RATES:
+            return self
+        for name, value, usual in (
+            ("compensate", self.compensate, False),
+            ("safe_velocity", self.safe_velocity, None),
+            ("costs.command_step", self.costs.command_step, 0.0),
+            ("costs.turn_step", self.costs.turn_step, 0.0),
+        ):
+            if value != usual:
+                raise ValueError(
+                    f"{name} = {value!r}: accepted: {usual!r} with actions {BODY_RATES!r}, which"
+                    " command no velocity"
+                )
+        return self
+
+    @model_validator(mode="after")
     def _told_of_heights(self) -> EnvironmentSpec:
         if self.goal_height and self.layout == "paper":
             raise ValueError("goal_height = true: accepted: false with layout 'paper'")
@@ -365,7 +391,9 @@ class EnvironmentSpec(ProfileModel):
     @property
     def action_spec(self) -> ActionSpec:
         """The action set with its fastest speed."""
-        return ActionSpec(set=self.actions, max_speed_m_s=self.max_speed_m_s)
+        return ActionSpec(
+            set=self.actions, max_speed_m_s=self.max_speed_m_s, max_rate_deg_s=self.max_rate_deg_s
+        )
 
 
 def spec_of(spec: EnvironmentSpec | None, knobs: Mapping[str, Any]) -> EnvironmentSpec:

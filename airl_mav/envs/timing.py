@@ -12,6 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.control.demand import KIND_US
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.envs.cameras import Cameras
@@ -22,6 +23,11 @@ from airl_mav.envs.saved_state import Stateful
 Times = NDArray[np.int64]
 """(n,) [µs], or in ticks."""
 
+RATES_FOLLOWED_US = KIND_US - 100_000
+"""Body rates are followed so long after a flight has begun: until then the flight controller flies
+the velocity with which the companion has switched to offboard, a tenth of a second before
+(`companion.mavsdk_link.OFFBOARD_SETTLE_S`) [µs]."""
+
 
 class Vehicles(Protocol):
     """What a decision is flown with: n vehicles and their cameras."""
@@ -29,6 +35,11 @@ class Vehicles(Protocol):
     @property
     def fleet(self) -> Fleet:
         """Their state."""
+        ...
+
+    @property
+    def by_rates(self) -> bool:
+        """Whether their setpoints are body rates and thrusts, and not velocities."""
         ...
 
     @property
@@ -73,7 +84,8 @@ class Timing(Protocol):
         Args:
             vehicles: What flies.
             setpoints: (n, 4) forward, right, down [m/s], yaw rate [rad/s]; the third, where it is
-                NaN, is written when it is sent: it then holds the altitude.
+                NaN, is written when it is sent: it then holds the altitude. Or body rates and
+                thrusts, see `Vehicles.by_rates`.
             t2_us: (n,) time of the inference.
 
         Returns:
@@ -142,7 +154,8 @@ class SequentialTiming(Stateful):
                 age[early] = self._age(vehicles, fleet.time_us, left)[early]
         else:
             self._wait(vehicles, sent, accepted, stop)
-            give(fleet, setpoints, np.ones(len(sent), np.bool_))
+            everyone = np.ones(len(sent), np.bool_)
+            give(fleet, setpoints, everyone, by_rates=vehicles.by_rates)
             age = self._age(vehicles, fleet.time_us, left)
             vehicles.advance(left - age)
             vehicles.capture(fleet.verdict >= 0)
@@ -173,7 +186,7 @@ class SequentialTiming(Stateful):
         reached = np.clip(stop, start, end)
         vehicles.advance(reached - start)
         over = (stop >= start) & (stop < end)
-        fleet.setpoint[over] = 0.0
+        fleet.setpoint[over], fleet.by_rates[over] = 0.0, False
         fleet.repeat_us[over] = fleet.time_us[over]
         vehicles.advance(end - reached)
 
@@ -223,13 +236,14 @@ class PipelinedTiming(Stateful):
             vehicles.advance(due[each, event] - now)
             now, real = due[each, event], happens[each, event]
             for k in range(room):
-                give(fleet, self._in_flight[:, room - 1 - k], (event == k) & real)
+                in_flight, arrived = self._in_flight[:, room - 1 - k], (event == k) & real
+                give(fleet, in_flight, arrived, by_rates=vehicles.by_rates)
             captured, decided = event == room, event == room + 1
             if captured.any():
                 vehicles.capture(captured)
             if decided.any():
                 _hold_altitude(vehicles, setpoints, decided)
-            give(fleet, setpoints, (event == room + 2) & real)
+            give(fleet, setpoints, (event == room + 2) & real, by_rates=vehicles.by_rates)
         vehicles.advance(ended - now)
         self._left[:, 1:] = np.maximum(self._left[:, :-1] - ended[:, None], 0)
         self._in_flight[:, 1:] = self._in_flight[:, :-1]
@@ -251,9 +265,16 @@ def _hold_altitude(
         setpoints[silent, 2] = vehicles.holding_altitude()[silent]
 
 
-def give(fleet: Fleet, setpoints: NDArray[np.float64], who: NDArray[np.bool_]) -> None:
-    """Give the vehicles in `who` (n,) their setpoints (n, 4); they take them at once."""
-    fleet.setpoint[who] = setpoints[who]
+def give(
+    fleet: Fleet, setpoints: NDArray[np.float64], who: NDArray[np.bool_], *, by_rates: bool
+) -> None:
+    """Give the vehicles in `who` (n,) their setpoints (n, 4); they take them at once.
+
+    Those are body rates and thrusts if `by_rates`, which nobody follows yet who has just begun.
+    """
+    if by_rates:
+        who = who & (fleet.time_us >= RATES_FOLLOWED_US)
+    fleet.setpoint[who], fleet.by_rates[who] = setpoints[who], by_rates
     fleet.repeat_us[who] = fleet.time_us[who]
 
 

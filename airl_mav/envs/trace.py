@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.core.constants import TICK_US, US_PER_S
+from airl_mav.core.constants import TICK_US, US_PER_S, CommandKind
 from airl_mav.envs.fleet import Fleet, Verdict
 from airl_mav.flight.trajectory import SAMPLE_US, Trajectory
-from airl_mav.latency.stamps import NO_STAMP
+from airl_mav.latency.stamps import NO_STAMP, SETPOINTS
 
 SAMPLE_TICKS = SAMPLE_US // TICK_US
 
@@ -63,7 +63,9 @@ class _Tables:
 class Trace:
     """Records n flights; a slot's record lasts until its next flight begins."""
 
-    def __init__(self, n: int) -> None:
+    def __init__(self, n: int, commands: CommandKind = "velocity") -> None:
+        """Record n flights of policies that command a velocity, or what else `commands` says."""
+        self._column = SETPOINTS[commands]
         self._samples = _Tables(n, STATE, np.float64)
         self._stamps = _Tables(n, len(STAMPS), np.int64)
         self._setpoints = _Tables(n, 4, np.float32)
@@ -133,7 +135,7 @@ class Trace:
 
         Args:
             fleet: As it is when the next decision begins.
-            setpoint: (n, 4) what was decided: forward, right, down [m/s], yaw rate [rad/s].
+            setpoint: (n, 4) what was decided, as `Fleet.setpoint`.
             t2_us: (n,) inference as modelled, before it was rounded to ticks [µs].
             transport_us: (n,) capture to decoded [µs].
             link_us: (n,) setpoint sent to first motor command [µs].
@@ -163,7 +165,7 @@ class Trace:
         )
 
     def latency(self, i: int) -> dict[str, NDArray[Any]]:
-        """Return the decisions of slot i by column: `STAMPS` (k,) [µs] and `setpoint` (k, 4)."""
+        """Return the decisions of slot i by column: `STAMPS` (k,) [µs] and setpoints (k, 4)."""
         stamps = self._stamps.of(i)
         columns = {name: stamps[:, k].copy() for k, name in enumerate(STAMPS)}
-        return {**columns, "setpoint": self._setpoints.of(i)}
+        return {**columns, self._column: self._setpoints.of(i)}

@@ -125,6 +125,7 @@ def navigation_of(
         battery_charge=asked.battery_charge,
         compensator=compensator,
         faults=asked.faults,
+        commands=scenario.pilot.commands,
     )
 
 
@@ -157,7 +158,7 @@ class GymFlier:
         def fly(episodes: Sequence[PlannedEpisode]) -> Iterator[FlownEpisode]:
             index_of = {episode.seed: episode.index for episode in episodes}
             slots = min(scenario.scenario.slots, len(index_of))
-            trace = Trace(slots)
+            trace = Trace(slots, scenario.pilot.commands)
             navigation = navigation_of(scenario, slots, trace=trace)
             zone = scenario.scenario.zone
             for slot, flown in fly_seeds(navigation, pilots, list(index_of), zone=zone, stop=stop):
@@ -216,7 +217,8 @@ def pilots_of(scenario: ResolvedScenario) -> Pilots:
         # As the companion draws them.
         return LearnedPilots(loaded, action_generator)
     seed = scenario.scenario.seed
-    return SinglePilots(lambda: scenario.fresh_policy(seed), scenario.pilot.max_speed_m_s)
+    pilot = scenario.pilot
+    return SinglePilots(lambda: scenario.fresh_policy(seed), pilot.max_speed_m_s, pilot.commands)
 
 
 def _reason(outcome: Outcome, flights: Flights, slot: int, arena: Arena, limit_s: float) -> str:

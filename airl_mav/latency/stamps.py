@@ -7,9 +7,13 @@ Recording costs about 0.3 µs on a desktop core.
 from __future__ import annotations
 
 import struct
+from collections.abc import Container, Mapping
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
+
+from airl_mav.core.constants import CommandKind
 
 NO_STAMP = -1
 """Stands for a time that never came: no frame, a setpoint that was not accepted."""
@@ -24,6 +28,12 @@ STAMPS = (
 )
 """Columns of simulated time [µs], in the order in which they happen."""
 
+SETPOINT, ATTITUDE, RATES = "setpoint", "attitude_setpoint", "rates_setpoint"
+SETPOINTS: Mapping[CommandKind, str] = MappingProxyType(
+    {"velocity": SETPOINT, "attitude": ATTITUDE, "body_rates": RATES}
+)
+"""Column of the setpoints, by what they command: who looks for velocities finds no others."""
+
 ROW = np.dtype([(name, "<i8") for name in STAMPS] + [("setpoint", "<f4", (4,))])
 """One decision, 64 bytes: the stamps, then the setpoint as the link sends it (float32)."""
 
@@ -33,12 +43,16 @@ _PACK = struct.Struct("<6q4f")
 class DecisionLog:
     """Stamps of every decision of one episode. One writer; readers get copies."""
 
-    __slots__ = ("_block", "_bytes", "_count")
+    __slots__ = ("_block", "_bytes", "_count", "_setpoints")
 
-    def __init__(self, capacity: int = 4096) -> None:
-        """Reserve room for `capacity` (>= 1) decisions; it doubles when full."""
+    def __init__(self, capacity: int = 4096, *, commands: CommandKind = "velocity") -> None:
+        """Reserve room for `capacity` (>= 1) decisions; it doubles when full.
+
+        `commands` is what the setpoints command, a key of `SETPOINTS`.
+        """
         if capacity < 1:
             raise ValueError(f"capacity={capacity}: must be >= 1")
+        self._setpoints = SETPOINTS[commands]
         self._block = np.zeros(capacity * ROW.itemsize, np.uint8)
         self._bytes = self._block.data
         self._count = 0
@@ -67,7 +81,8 @@ class DecisionLog:
             sent_us: The setpoint was handed to MAVSDK.
             held_until_us: End of the time that the action is held before the next observation.
             setpoint: Velocity north, east, down (or forward, right, down) [m/s] and yaw [rad] or
-                yaw rate [rad/s]: the four numbers the autopilot receives.
+                yaw rate [rad/s]; or roll, pitch and yaw [rad], or the body rates [rad/s], and the
+                thrust 0..1: the four numbers the autopilot receives.
         """
         offset = self._count * ROW.itemsize
         if offset == len(self._bytes):
@@ -91,7 +106,19 @@ class DecisionLog:
         self._bytes = self._block.data
 
     def columns(self) -> dict[str, NDArray[np.int64] | NDArray[np.float32]]:
-        """Return a copy of each column by name: stamps int64 (n,), `setpoint` float32 (n, 4)."""
+        """Return a copy of each column by name: stamps int64 (n,), setpoints float32 (n, 4)."""
         count = self._count
         rows = self._block[: count * ROW.itemsize].view(ROW)
-        return {name: rows[name].copy() for name in ROW.names or ()}
+        return {name: rows[name].copy() for name in STAMPS} | {
+            self._setpoints: rows["setpoint"].copy()
+        }
+
+
+def setpoint_column(columns: Container[str]) -> str | None:
+    """Return the name of the column that holds the setpoints of decisions; None: there is none."""
+    return next((name for name in SETPOINTS.values() if name in columns), None)
+
+
+def commanded(columns: Container[str]) -> CommandKind:
+    """Return what the setpoints of decisions command; without any a velocity, as most do."""
+    return next((kind for kind, name in SETPOINTS.items() if name in columns), "velocity")

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.policy.actions import Action, Policy
+from airl_mav.policy.actions import AnyAction, Policy
 from airl_mav.policy.observation import Observation
 
 LANES = ("trajectory", "setpoints", "observations", "telemetry", "commands")
@@ -65,7 +65,7 @@ class WitnessedPolicy:
         self._policy = policy
         self._digest = digest
 
-    def act(self, observation: Observation) -> Action:
+    def act(self, observation: Observation) -> AnyAction:
         """Return the policy's action."""
         seen = observation
         numbers = np.array([*seen.goal, *seen.velocity, seen.roll, seen.pitch, seen.yaw])

@@ -1,12 +1,12 @@
-"""Action sets: from a network's output to a velocity command, in one place.
+"""Action sets: from a network's output to a command, in one place.
 
 `arc-25`: five speeds with five yaw rates. `paper-25`: the 25 actions of the paper's text.
 `velocity`: the paper's continuous pair, forward and right speed, the nose following;
 `velocity-fixed-yaw`: the same pair, the nose staying where it is. Those of three dimensions also
 command how fast the vehicle sinks or climbs, where the others hold an altitude: `velocity3d` and
 `velocity3d-fixed-yaw`, as these two with a third number, and `arc3d-75`: `arc-25` climbing, level
-and sinking. Any other is the user's own: a
-class, made without arguments, whose objects are an `ActionSet`.
+and sinking. `body-rates` commands no velocity: three body rates and a collective thrust. Any other
+is the user's own: a class, made without arguments, whose objects are an `ActionSet`.
 """
 
 from __future__ import annotations
@@ -19,19 +19,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.core import plugins
+from airl_mav.core.constants import CommandKind
 from airl_mav.core.errors import FieldError, UsageError
-from airl_mav.core.fields import ProfileModel, quantity
-from airl_mav.policy.actions import Action, fastest_climb
+from airl_mav.core.fields import ProfileModel, later_field, quantity
+from airl_mav.policy.actions import Action, BodyRates, fastest_climb
 
+BODY_RATES = "body-rates"
 FIXED_YAW = ("velocity-fixed-yaw", "velocity3d-fixed-yaw")
-CONTINUOUS = ("velocity", "velocity3d", *FIXED_YAW)
+VELOCITIES = ("velocity", "velocity3d", *FIXED_YAW)
+CONTINUOUS = (*VELOCITIES, BODY_RATES)
 VERTICAL = ("arc3d-75", "velocity3d", "velocity3d-fixed-yaw")
 """The sets that command a vertical speed, too."""
 
 DISCRETE = {"arc-25": 25, "paper-25": 25, "arc3d-75": 75}
 """Numbers of actions."""
 
-SHIPPED = ("arc-25", "paper-25", "velocity", "velocity-fixed-yaw", *VERTICAL)
+SHIPPED = ("arc-25", "paper-25", "velocity", "velocity-fixed-yaw", *VERTICAL, BODY_RATES)
 ActionSetName = Annotated[str, plugins.part_name(plugins.ACTION_SETS, SHIPPED)]
 
 PAPER_SPEED_M_S = 5.0
@@ -57,13 +60,28 @@ FOLLOW_MAX_RAD_S = math.radians(90.0)
 """`velocity`: greatest yaw rate [rad/s]."""
 
 
+MAX_RATE_DEG_S = 180.0
+"""`body-rates`: greatest rate; PX4 flies up to 220 deg/s about roll and pitch, and 200 deg/s about
+yaw by default (MC_ROLLRATE_MAX, MC_PITCHRATE_MAX, MC_YAWRATE_MAX) [deg/s]."""
+
+MaxRate = Annotated[
+    float, quantity("greatest body rate of the set body-rates", "deg/s", gt=0, le=1800)
+]
+
+
 class ActionSpec(ProfileModel):
-    """An action set and its fastest speed."""
+    """An action set and its fastest speed, or greatest rate."""
 
     set: ActionSetName = "arc-25"
     max_speed_m_s: float = quantity(
         "fastest action; all speeds scale with it", "m/s", gt=0, le=30, default=PAPER_SPEED_M_S
     )
+    max_rate_deg_s: MaxRate = later_field(MAX_RATE_DEG_S)
+
+    @property
+    def commands(self) -> CommandKind:
+        """What an action of the set commands."""
+        return "body_rates" if self.set == BODY_RATES else "velocity"
 
 
 class ActionSet(Protocol):
@@ -88,6 +106,8 @@ def discrete_actions(spec: ActionSpec) -> int | None:
 
 def continuous_numbers(spec: ActionSpec) -> int:
     """Return how many numbers an action of a continuous set has."""
+    if spec.set == BODY_RATES:
+        return len(BodyRates._fields)
     return 3 if spec.set in VERTICAL else 2
 
 
@@ -96,19 +116,26 @@ def commands_vertical_speed(spec: ActionSpec) -> bool:
     return spec.set in VERTICAL
 
 
+def command_numbers(spec: ActionSpec) -> int:
+    """Return how many numbers a command of an action set has, as `commands` gives it."""
+    return 4 if spec.set in (*VERTICAL, BODY_RATES) else 3
+
+
 def commands(spec: ActionSpec, actions: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the velocity commands of n actions.
+    """Return the commands of n actions.
 
     Args:
         spec: The action set.
         actions: (n,) whole numbers, from 0 on, of a discrete set; (n, 2) numbers of a continuous
             one: of those shipped, forward and right speed, each -1..1 of the fastest; anything
             beyond is cut off. Of a set of three dimensions (n, 3): also the downward speed, of
-            the fastest climb (`actions.fastest_climb`).
+            the fastest climb (`actions.fastest_climb`). Of `body-rates` (n, 4): roll, pitch and
+            yaw rate, each -1..1 of the greatest, and thrust, -1 for none to 1 for all.
 
     Returns:
         (n, 3) forward and right [m/s] in the heading frame, yaw rate [rad/s], clockwise positive;
-        of a set of three dimensions (n, 4): behind them the downward speed [m/s].
+        of a set of three dimensions (n, 4): behind them the downward speed [m/s]. Of `body-rates`
+        (n, 4): as `actions.BodyRates`.
 
     Raises:
         UsageError: A set of the user's gives anything else.
@@ -119,6 +146,9 @@ def commands(spec: ActionSpec, actions: NDArray[Any]) -> NDArray[np.float64]:
         chosen: NDArray[np.float64] = _table(spec.set, spec.max_speed_m_s)[np.asarray(actions)]
         return chosen
     shares = np.clip(np.asarray(actions, np.float64), -1.0, 1.0)
+    if spec.set == BODY_RATES:
+        rates = shares[:, :3] * math.radians(spec.max_rate_deg_s)
+        return np.concatenate([rates, 0.5 * (1.0 + shares[:, 3:])], axis=1)
     wanted = shares[:, :2] * spec.max_speed_m_s
     # A vector, not a pair: the corner of the square is no faster than its edges.
     speed = np.hypot(wanted[:, 0], wanted[:, 1])
@@ -160,9 +190,12 @@ def _own(name: str) -> ActionSet:
     return cast("ActionSet", own)
 
 
-def command(spec: ActionSpec, action: NDArray[Any]) -> Action:
-    """Return the command of one action, () or (2,); (3,) of a set of three dimensions."""
-    forward, right, turn, *down = map(float, commands(spec, np.asarray(action)[None])[0])
+def command(spec: ActionSpec, action: NDArray[Any]) -> Action | BodyRates:
+    """Return the command of one action, () or (2,); (3,) of a set of three dimensions, or (4,)."""
+    numbers = commands(spec, np.asarray(action)[None])[0].tolist()
+    if spec.set == BODY_RATES:
+        return BodyRates(*numbers)
+    forward, right, turn, *down = numbers
     return Action(forward, right, turn, down[0] if down else None)
 
 

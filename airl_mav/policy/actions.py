@@ -1,16 +1,18 @@
-"""What a policy does: a velocity and a yaw rate in the heading frame."""
+"""What a policy does: it commands a velocity, or an attitude, or body rates, with a thrust."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, Protocol, runtime_checkable
+from typing import Any, Literal, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.core.constants import CommandKind
+from airl_mav.core.errors import FieldError
 from airl_mav.policy.observation import Observation
 
 DecisionTiming = Literal["sequential", "pipelined"]
@@ -28,6 +30,40 @@ class Action:
     down_m_s: float | None = None
     """Positive downwards; None: the pilot adds the vertical speed that holds the altitude."""
 
+
+class Attitude(NamedTuple):
+    """An attitude and a collective thrust. Nothing but the policy controls the velocity."""
+
+    roll_rad: float
+    """Positive: right side down."""
+    pitch_rad: float
+    """Positive: nose up."""
+    yaw_rad: float
+    """Heading, 0 = north, positive to the east."""
+    thrust: float
+    """Collective, 0 to 1 of what the motors can; what hovers is MPC_THR_HOVER of PX4."""
+
+
+class BodyRates(NamedTuple):
+    """Body rates and a collective thrust (CTBR). Nothing but the policy controls the attitude."""
+
+    roll_rate_rad_s: float
+    """Body FRD, as the two others: about the axis forward, ..."""
+    pitch_rate_rad_s: float
+    """... to the right, ..."""
+    yaw_rate_rad_s: float
+    """... and downward."""
+    thrust: float
+    """As of `Attitude`."""
+
+
+AnyAction: TypeAlias = "Action | Attitude | BodyRates"
+
+KINDS: dict[CommandKind, type[Any]] = {
+    "velocity": Action,
+    "attitude": Attitude,
+    "body_rates": BodyRates,
+}
 
 ALTITUDE_P = 0.5
 """Vertical speed per metre of altitude error [1/s]: slow enough for decisions 1.5 s apart."""
@@ -63,11 +99,27 @@ def vertical_speeds(altitude_m: float, down_m: NDArray[np.float64]) -> NDArray[n
 
 
 class Policy(Protocol):
-    """Anything that decides."""
+    """Anything that decides.
 
-    def act(self, observation: Observation) -> Action:
+    What commands no velocity says so: by an attribute `commands`, of its class or its own, which is
+    one of `CommandKind`. Without one it commands a velocity.
+    """
+
+    def act(self, observation: Observation) -> AnyAction:
         """Return the action for an observation."""
         ...
+
+
+def command_kind(policy: object) -> CommandKind:
+    """Return what a policy, or the class of one, commands.
+
+    Raises FieldError when it says anything else.
+    """
+    kind = getattr(policy, "commands", "velocity")
+    for known in KINDS:
+        if kind == known:
+            return known
+    raise FieldError("policy", problem=f"commands = {kind!r}; accepted: {', '.join(KINDS)}")
 
 
 @runtime_checkable
@@ -91,6 +143,30 @@ class RigBound(CameraBound, Protocol):
     def refuses_further(self, cameras: Mapping[str, Intrinsics]) -> str | None:
         """Return why further cameras, by name, cannot serve the policy, or None when they can."""
         ...
+
+
+def flyable(action: AnyAction, kind: CommandKind, speed_m_s: float) -> AnyAction:
+    """Return an action as it may be sent: a velocity `limited`, a thrust within 0..1.
+
+    Args:
+        action: What a policy has returned.
+        kind: What it commands.
+        speed_m_s: Limit of velocities [m/s].
+
+    Raises:
+        TypeError: It is of another kind.
+        ValueError: An attitude, a body rate or a thrust is no number: nothing is safe to put in its
+            place.
+    """
+    wanted = KINDS[kind]
+    if not isinstance(action, wanted):
+        raise TypeError(f"it returned {type(action).__name__}; accepted: {wanted.__name__}")
+    if isinstance(action, Action):
+        return limited(action, speed_m_s)
+    if not all(map(math.isfinite, action)):
+        raise ValueError(f"it returned what is no number: {action}")
+    within: AnyAction = action._replace(thrust=min(1.0, max(0.0, action.thrust)))
+    return within
 
 
 def limited(action: Action, speed_m_s: float) -> Action:

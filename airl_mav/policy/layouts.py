@@ -22,9 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.core.errors import UsageError
-from airl_mav.core.frames import heading_to_ned
+from airl_mav.core.frames import down_in_body, heading_to_ned
 from airl_mav.policy.images import NUMPY, Bytes, Shrink, body_bytes, paper_bytes
-from airl_mav.policy.observation import InFlight, Observation
+from airl_mav.policy.observation import Observation
 from airl_mav.policy.observation_spec import (
     SHIPPED,
     STRIP_ROWS,
@@ -113,7 +113,8 @@ def encode_layout(spec: ObservationSpec, seen: Observation, shrink: Shrink = NUM
         vehicle / 5 m, and the distance is the level one. `paper`: velocity NED [m/s]; goal as
         north, east [m] and distance [m].
         Where the network is told more, `in_flight` (n, k) float32: forward, right / 5 m/s and yaw
-        rate [rad/s]; latency [s]; age [s].
+        rate [rad/s]; latency [s]; age [s]; the setpoint as `InFlight.setpoint` has it; down in
+        body axes FRD; body rates [rad/s].
         Of each further camera its image as in `body`, whichever layout it is: `grey_down`
         (n, frames, height, width) of a grey camera called down.
 
@@ -146,7 +147,7 @@ def encode_layout(spec: ObservationSpec, seen: Observation, shrink: Shrink = NUM
         GOAL: goal.astype(np.float32),
     }
     if spec.in_flight:
-        encoded[IN_FLIGHT] = _told(spec.in_flight, seen.in_flight)
+        encoded[IN_FLIGHT] = _told(spec.in_flight, seen)
     return encoded | _further(spec, seen, shrink)
 
 
@@ -210,16 +211,27 @@ def _scans(spec: ObservationSpec, seen: Observation, shrink: Shrink) -> NDArray[
     return scan_bytes(scans, spec.range_m)[:, None, :, columns]
 
 
-def _told(names: tuple[Told, ...], known: InFlight | None) -> NDArray[np.float32]:
-    """Return what networks are told of the decisions of n vehicles (n, k)."""
+def _told(names: tuple[Told, ...], seen: Observation) -> NDArray[np.float32]:
+    """Return what networks are told of n vehicles and of their decisions (n, k)."""
+    return np.concatenate([_part(name, seen) for name in names], axis=1).astype(np.float32)
+
+
+def _part(name: Told, seen: Observation) -> NDArray[np.float64]:
+    """Return one thing that networks are told of n vehicles (n, k)."""
+    known, state = seen.in_flight, seen.states[0] if seen.states else None
+    if name == "tilt":
+        return down_in_body(np.asarray(seen.roll), np.asarray(seen.pitch))
+    if name == "rates":
+        if state is None or state.rates is None:
+            raise ValueError("the network is told the body rates, and nobody measures them")
+        return np.asarray(state.rates, np.float64)
     if known is None:
-        raise ValueError(f"the network is told {', '.join(names)}, and nobody keeps account of it")
-    parts = {
-        "command": known.command / (SPEED_SCALE_M_S, SPEED_SCALE_M_S, 1.0),
-        "latency": np.asarray(known.latency_s)[:, None],
-        "age": np.asarray(known.age_s)[:, None],
-    }
-    return np.concatenate([parts[name] for name in names], axis=1).astype(np.float32)
+        raise ValueError(f"the network is told {name}, and nobody keeps account of it")
+    if name == "command":
+        return np.asarray(known.command / (SPEED_SCALE_M_S, SPEED_SCALE_M_S, 1.0))
+    if name == "setpoint":
+        return np.asarray(known.setpoint)
+    return np.asarray(known.latency_s if name == "latency" else known.age_s)[:, None]
 
 
 def newest_frame(spec: ObservationSpec, seen: Mapping[str, NDArray[Any]]) -> NDArray[np.uint8]:

@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.core.constants import CommandKind
 from airl_mav.core.errors import UsageError
 from airl_mav.policy.action_sets import ActionSpec, command, discrete_actions
-from airl_mav.policy.actions import Action
+from airl_mav.policy.actions import Action, BodyRates
 from airl_mav.policy.card import (
     TORCH_FILE,
     PolicyCard,
@@ -79,6 +80,11 @@ class LearnedPolicy:
         """Name on the card."""
         return self.card.name
 
+    @property
+    def commands(self) -> CommandKind:
+        """What its actions command."""
+        return self.card.actions.commands
+
     def with_generator(self, rng: np.random.Generator) -> LearnedPolicy:
         """Return the same policy at its first decision, with another source of random actions."""
         return LearnedPolicy(self.card, self._runtime, rng=rng, ablate=self._ablate)
@@ -91,7 +97,7 @@ class LearnedPolicy:
         """Return why further cameras, by name, cannot serve the policy, or None when they can."""
         return further_mismatch(self.card.observation, cameras)
 
-    def act(self, observation: Observation) -> Action:
+    def act(self, observation: Observation) -> Action | BodyRates:
         """Return the action for an observation of one vehicle.
 
         Raises:

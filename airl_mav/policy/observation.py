@@ -30,31 +30,48 @@ class Kinematics:
     position: Vector  # (..., 3) local NED [m]
     velocity: Vector  # (..., 3) NED [m/s]
     quaternion: Vector  # (..., 4) body FRD -> NED
+    rates: Vector | None = None  # (..., 3) body FRD [rad/s]; None: nobody tells them
+
+    def known(self) -> dict[str, Vector]:
+        """Return position, velocity and quaternion by name: what is always known."""
+        return {
+            "position": self.position,
+            "velocity": self.velocity,
+            "quaternion": self.quaternion,
+        }
 
     def rows(self, index: Rows) -> Kinematics:
         """Return that of vehicle `index` of n, or of several of them."""
-        return Kinematics(self.position[index], self.velocity[index], self.quaternion[index])
+        rates = None if self.rates is None else self.rates[index]
+        return Kinematics(self.position[index], self.velocity[index], self.quaternion[index], rates)
 
 
 @dataclass(frozen=True)
 class InFlight:
     """What a companion knows of its own decisions, of one or of n."""
 
-    command: Vector  # (..., 3) newest setpoint: forward, right [m/s], yaw rate [rad/s]
     latency_s: Vector
     """(...) latency t2 that is expected of this decision [s]."""
     age_s: Vector
     """(...) how long ago the image was taken [s]."""
+    setpoint: Vector
+    """(..., 4) newest setpoint whole: as `actions.BodyRates`, `actions.Attitude`, or a velocity
+    forward, right, down [m/s] and a yaw rate [rad/s]; zeros before the first."""
+
+    @property
+    def command(self) -> Vector:
+        """(..., 3) newest velocity setpoint: forward, right [m/s], yaw rate [rad/s]."""
+        return self.setpoint[..., (0, 1, 3)]
 
     @classmethod
     def of_first_decisions(cls, n: int) -> InFlight:
         """Return that of n companions which have not decided yet."""
-        return cls(np.zeros((n, 3)), np.zeros(n), np.zeros(n))
+        return cls(np.zeros(n), np.zeros(n), np.zeros((n, 4)))
 
     def rows(self, index: Rows) -> InFlight:
         """Return that of companion `index` of n, or of several of them."""
         latency_s, age_s = np.asarray(self.latency_s), np.asarray(self.age_s)
-        return InFlight(self.command[index], latency_s[index], age_s[index])
+        return InFlight(latency_s[index], age_s[index], self.setpoint[index])
 
 
 @dataclass(frozen=True)
@@ -98,7 +115,8 @@ class Observation:
     earlier: tuple[NDArray[Any], ...] = ()
     """The images of the decisions before, as far as they are kept, the newest first."""
     states: tuple[Kinematics, ...] = ()
-    """Own states: the present one, and behind it those of `earlier`."""
+    """Own states: the present one, with attitude and body rates as telemetry has them, and behind
+    it those of `earlier`."""
     goal_down: Vector | None = None
     """(...) how far the goal lies below the vehicle [m]; None: it has no height."""
     further: Mapping[str, View] = field(default_factory=dict)

@@ -29,10 +29,17 @@ LayoutName = Annotated[str, plugins.part_name(plugins.LAYOUTS, SHIPPED)]
 Encoded = dict[str, NDArray[Any]]
 """Arrays of a layout, by key."""
 
-Told = Literal["command", "latency", "age"]
+Told = Literal["command", "latency", "age", "setpoint", "tilt", "rates"]
 
-TOLD: dict[Told, int] = {"command": 3, "latency": 1, "age": 1}
-"""Numbers of each thing that a network may be told of the decisions."""
+TOLD: dict[Told, int] = {
+    "command": 3,
+    "latency": 1,
+    "age": 1,
+    "setpoint": 4,
+    "tilt": 3,
+    "rates": 3,
+}
+"""Numbers of each thing that a network may be told of the decisions, and of the attitude."""
 
 STRIP_ROWS = 10
 """`paper`: rows on top of the image that draw the bearing of the goal, the last one black."""
@@ -160,8 +167,9 @@ class ObservationSpec(ProfileModel):
     frames: Frames = 1
     in_flight: tuple[Told, ...] = Field(
         default=(),
-        description="what else the network is told: command, the newest setpoint; latency, the t2"
-        " that is expected; age, of the image",
+        description="what else the network is told: command, the newest velocity setpoint; latency,"
+        " the t2 that is expected; age, of the image; setpoint, the newest of any kind, all four"
+        " numbers of it; tilt, where down is in the body's axes; rates, the body's",
     )
     goal_height: GoalHeight = later_field(default=False)
     cameras: dict[CameraName, SeenCamera] = later_field(

@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from airl_mav.core.constants import CommandKind
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.plugins import POLICIES as DOOR
 from airl_mav.core.plugins import announced, digest_of, load_part, names_code, reference
-from airl_mav.policy.actions import Policy
+from airl_mav.policy.actions import Policy, command_kind
 from airl_mav.policy.card import CARD_FILE, ONNX_FILE, PolicyCard, load_card, vehicle_mismatch
 from airl_mav.policy.greedy import GreedyPolicy, GreedySettings
 from airl_mav.policy.learned import load_learned
@@ -49,6 +50,13 @@ class PolicyInfo:
         if self.program is not None:
             return digest_of(self.program)
         return None if self.card is None else self.card.sha256
+
+    @property
+    def commands(self) -> CommandKind:
+        """What it commands. Raises FieldError when a class of the user's says nonsense."""
+        if self.program is not None:
+            return command_kind(_policy_class(self.program))
+        return "velocity" if self.card is None else self.card.actions.commands
 
     @property
     def macs(self) -> int | None:

@@ -21,7 +21,7 @@ class DecisionMemory:
         self.latency = ExpectedLatency(n)
         """What t2 to expect."""
         self.newest = np.zeros((n, 4))
-        """(n, 4) newest setpoints: forward, right, down [m/s], yaw rate [rad/s]."""
+        """(n, 4) newest setpoints, as `InFlight.setpoint`."""
 
     def begin(self, i: int) -> None:
         """Begin a flight of companion i, in a hover."""
@@ -38,9 +38,9 @@ class DecisionMemory:
     def in_flight(self, age_us: NDArray[np.int64]) -> InFlight:
         """Return what policies may be told; `age_us` (n,) is how old the images are."""
         return InFlight(
-            self.newest[:, (0, 1, 3)],
             self.latency.expected_us() / US_PER_S,
             age_us / US_PER_S,
+            self.newest,
         )
 
     def held(self) -> Mapping[str, Any]:

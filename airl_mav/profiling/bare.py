@@ -13,7 +13,7 @@ from airl_mav.camera.frame import Frame, FurtherImage
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.clock import WallClock, processor_time_us
 from airl_mav.core.progress import Bar
-from airl_mav.policy.actions import limited
+from airl_mav.policy.actions import flyable
 from airl_mav.policy.learned import LearnedPolicy, open_network
 from airl_mav.policy.observation import Kinematics, encode
 from airl_mav.policy.observation_spec import ObservationSpec, SeenCamera, camera_mismatch
@@ -55,7 +55,8 @@ class BareLoop:
         """Make a decision; return when it began and when it ended [µs]."""
         frame, state = next(self._observations)
         start_us = self.clock.time_us()
-        limited(self._policy.act(encode(frame, state, GOAL)), self._max_speed_m_s)
+        action = self._policy.act(encode(frame, state, GOAL))
+        flyable(action, self._policy.commands, self._max_speed_m_s)
         return start_us, self.clock.time_us()
 
 

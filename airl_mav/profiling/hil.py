@@ -14,7 +14,7 @@ from airl_mav.core.constants import US_PER_MS
 from airl_mav.core.progress import Bar
 from airl_mav.latency.clock_offset import ClockError, ClockRelation, Exchanges, relate
 from airl_mav.latency.stamps import STAMPS
-from airl_mav.policy.actions import Action, Policy
+from airl_mav.policy.actions import AnyAction, Policy
 from airl_mav.policy.observation import Observation
 from airl_mav.profiling.bare import cold_start
 from airl_mav.profiling.measurement import ProfilingError, Recording, Stamps
@@ -60,7 +60,7 @@ class DecisionLimit:
         self._stop, self._bar = stop, bar
         self._count = 0
 
-    def act(self, observation: Observation) -> Action:
+    def act(self, observation: Observation) -> AnyAction:
         """Return the policy's action."""
         # Stopped before the decision, not after: the pilot drops the one that it is stopped in.
         if self._count == self._limit:

@@ -21,7 +21,7 @@ from airl_mav.flight.trajectory import Trajectory
 from airl_mav.flight.validity import BY_HAND, host_faults, host_figures
 from airl_mav.latency.matching import match_setpoints, stamps_of
 from airl_mav.latency.stages import stage_durations
-from airl_mav.latency.stamps import STAMPS
+from airl_mav.latency.stamps import SETPOINT, STAMPS, setpoint_column
 from airl_mav.profiles.camera_kind import SLOW
 from airl_mav.rehearsal.channel import Ended, Loaded, State
 from airl_mav.rehearsal.process_faults import ProcessFaults
@@ -270,7 +270,7 @@ def join_stamps(
         return {**decisions, **by_simulator}
     index = match_setpoints(
         by_simulator["sent_us"],
-        decisions["setpoint"],
+        decisions[setpoint_column(decisions) or SETPOINT],
         setpoints["accepted_us"],
         setpoints["setpoint"],
     )

@@ -23,7 +23,7 @@ from airl_mav.report.tracking import EstimateErrors, Motion, TrackedFlight
 TIME_POINTS = 1000
 """A line has at most this many points: 20 s at the recorded rate, or what is seen of more."""
 
-UNITS = {"_m_s": 0.01, "_m": 0.01, "_deg": 0.1, "_deg_s": 0.1}
+UNITS = {"_m_s": 0.01, "_m": 0.01, "_deg": 0.1, "_deg_s": 0.1, "thrust": 0.001}
 """Numbers are kept to half of this, by the unit that a name ends with."""
 
 IMAGES = 24
@@ -73,9 +73,7 @@ def flight_data(
         "altitude": flight.altitude_m,
         "commands": {
             "sent": steps_of(commands.sent_s, 0.001),
-            "forward_m_s": steps_of(commands.forward_m_s, 0.01),
-            "right_m_s": steps_of(commands.right_m_s, 0.01),
-            "yaw_rate_deg_s": steps_of(commands.yaw_rate_deg_s, 0.1),
+            **{name: steps_of(values, _unit(name)) for name, values in commands.values.items()},
         },
         "stages": _stages(stamps),
         "seen": [_seen(seen[k], range_m, again) for k in chosen(len(seen))],
@@ -84,7 +82,8 @@ def flight_data(
 
 def _lines(of: Motion | EstimateErrors, keep: NDArray[np.int64]) -> dict[str, Steps]:
     """Return each array of a dataclass by its name."""
-    return {name: steps_of(values[keep], _unit(name)) for name, values in vars(of).items()}
+    known = {name: values for name, values in vars(of).items() if values is not None}
+    return {name: steps_of(values[keep], _unit(name)) for name, values in known.items()}
 
 
 def _outputs(motors: NDArray[np.float64]) -> list[Steps]:

@@ -225,7 +225,7 @@ class _Companion:
         earlier = self._earlier
         self._earlier = ((image, state), *earlier)[: MOST_FRAMES - 1]
         where = np.asarray(goal, np.float64)
-        in_flight = InFlight(told.command, told.latency_s, told.age_s)
+        in_flight = InFlight(told.latency_s, told.age_s, told.setpoint)
         return observe(image, self._intrinsics, state, where, in_flight, earlier, further)
 
     def decided(

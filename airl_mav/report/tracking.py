@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.files import Arrays
-from airl_mav.core.frames import ned_to_heading, quats_to_euler
+from airl_mav.core.frames import ned_to_heading, quat_multiply, quats_to_euler
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory
-from airl_mav.latency.stamps import NO_STAMP
+from airl_mav.latency.stamps import ATTITUDE, NO_STAMP, RATES, SETPOINT, setpoint_column
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report.forensics.worst import flown_path
 
@@ -35,6 +36,21 @@ class Motion:
     """(m,) clockwise seen from above: the heading's difference from sample to sample."""
     roll_deg: Floats
     pitch_deg: Floats
+    heading_deg: Floats | None = None
+    """-180 to 180; this and the following only of a flight that is commanded by them."""
+    body_roll_rate_deg_s: Floats | None = None
+    """About the body's axes FRD, from sample to sample."""
+    body_pitch_rate_deg_s: Floats | None = None
+    body_yaw_rate_deg_s: Floats | None = None
+
+
+COMMANDED: Mapping[str, tuple[str, ...]] = {
+    SETPOINT: ("forward_m_s", "right_m_s", "", "yaw_rate_deg_s"),
+    ATTITUDE: ("roll_deg", "pitch_deg", "heading_deg", "thrust"),
+    RATES: ("body_roll_rate_deg_s", "body_pitch_rate_deg_s", "body_yaw_rate_deg_s", "thrust"),
+}
+"""The four numbers of a setpoint by the column that they stand in: named as the fields of `Motion`,
+and the thrust; what has no name is not shown. What ends with _deg or _deg_s is recorded in rad."""
 
 
 @dataclass(frozen=True)
@@ -43,10 +59,9 @@ class Commands:
 
     sent_s: Floats
     """(n,) since the start of navigation."""
-    forward_m_s: Floats
-    """(n,) along the heading, which the vehicle may turn meanwhile."""
-    right_m_s: Floats
-    yaw_rate_deg_s: Floats
+    values: Mapping[str, Floats]
+    """(n,) each, by name (`COMMANDED`); velocities are along the heading, which the vehicle may
+    turn meanwhile."""
 
 
 @dataclass(frozen=True)
@@ -91,6 +106,11 @@ def track(run: LoadedRun, record: EpisodeRecord) -> TrackedFlight | None:
     stamps = run.latency.get(record.index, {})
     zero_us = record.started_us if record.navigation_us is None else record.navigation_us
     flown, heading = _motion(path.time_us, path.position, path.velocity, path.quaternion)
+    commands = commands_of(stamps, zero_us)
+    if "heading_deg" in commands.values:
+        flown = replace(flown, heading_deg=np.degrees(np.angle(np.exp(1j * heading))))
+    elif "body_roll_rate_deg_s" in commands.values:
+        flown = replace(flown, **_turned(path))
     estimated = errors = None
     if len(stamps.get("estimate/time_us", ())) > 1:
         believed = _at(stamps, path.time_us)
@@ -104,7 +124,7 @@ def track(run: LoadedRun, record: EpisodeRecord) -> TrackedFlight | None:
         flown=flown,
         estimated=estimated,
         errors=errors,
-        commands=commands_of(stamps, zero_us),
+        commands=commands,
         altitude_m=run.info.config.get("pilot", {}).get("altitude_m"),
         power_w=path.power_w,
         motors=_motors(stamps, path.time_us),
@@ -123,10 +143,16 @@ def _motors(stamps: Arrays, time_us: NDArray[np.int64]) -> Floats | None:
 def commands_of(stamps: Arrays, zero_us: int) -> Commands:
     """Return the setpoints that were sent, as time counts from `zero_us`."""
     sent = np.asarray(stamps.get("sent_us", np.zeros(0)), np.int64)
-    setpoint = np.asarray(stamps.get("setpoint", np.zeros((len(sent), 4))), np.float64)
+    column = setpoint_column(stamps) or SETPOINT
+    setpoint = np.asarray(stamps.get(column, np.zeros((len(sent), 4))), np.float64)
     there = sent != NO_STAMP
-    forward, right, _, turn = setpoint[there].T if there.any() else np.zeros((4, 0))
-    return Commands((sent[there] - zero_us) / US_PER_S, forward, right, np.degrees(turn))
+    numbers = setpoint[there].T if there.any() else np.zeros((4, 0))
+    values = {
+        name: np.degrees(row) if name.endswith(("_deg", "_deg_s")) else row
+        for name, row in zip(COMMANDED[column], numbers, strict=True)
+        if name
+    }
+    return Commands((sent[there] - zero_us) / US_PER_S, values)
 
 
 def _motion(
@@ -146,6 +172,21 @@ def _motion(
         pitch_deg=np.degrees(pitch),
     )
     return motion, heading
+
+
+def _turned(path: Trajectory) -> dict[str, Floats]:
+    """Return the body rates (m,) [deg/s], by their names in `Motion`."""
+    q = path.quaternion
+    turn = quat_multiply((q[:-1] * (1.0, -1.0, -1.0, -1.0)).T, q[1:].T).T
+    sine = np.linalg.norm(turn[:, 1:], axis=1)
+    # q and -q are the same attitude: by the shorter way.
+    angle = 2.0 * np.arctan2(sine, np.abs(turn[:, 0])) * np.where(turn[:, 0] < 0.0, -1.0, 1.0)
+    passed_s = np.diff(path.time_us) / US_PER_S
+    steps = turn[:, 1:] * (angle / np.maximum(sine, 1e-12) / passed_s)[:, None]
+    # Between two samples; at a sample the mean of both sides.
+    sides = np.concatenate([steps[:1], steps, steps[-1:]])
+    rates = np.degrees(0.5 * (sides[:-1] + sides[1:]))
+    return dict(zip(COMMANDED[RATES], rates.T, strict=False))
 
 
 def _at(stamps: Arrays, time_us: NDArray[np.int64]) -> Trajectory:

@@ -31,6 +31,22 @@ BEFORE_S = 2.0
 IMAGES = 5
 """Depth images above the rows."""
 
+ALWAYS = ("forward_m_s", "right_m_s")
+"""Rows that every flight has, whatever it is commanded."""
+
+LABELS = {
+    "forward_m_s": "forward\n[m/s]",
+    "right_m_s": "right\n[m/s]",
+    "yaw_rate_deg_s": "yaw rate\n[°/s]",
+    "roll_deg": "roll\n[°]",
+    "pitch_deg": "pitch\n[°]",
+    "heading_deg": "heading\n[°]",
+    "body_roll_rate_deg_s": "roll rate\n[°/s]",
+    "body_pitch_rate_deg_s": "pitch rate\n[°/s]",
+    "body_yaw_rate_deg_s": "yaw rate\n[°/s]",
+    "thrust": "thrust\n[0..1]",
+}
+
 COMMANDED = theme.MARK
 FLOWN = theme.SERIES
 ESTIMATED = "#2c9a5b"
@@ -95,16 +111,15 @@ def _rows(flight: TrackedFlight) -> list[tuple[str, list[_Line]]]:
     """Return the rows, from the top: label and lines."""
     flown, estimated, errors, t = flight.flown, flight.estimated, flight.errors, flight.time_s
     rows = []
-    for name, label in (
-        ("forward_m_s", "forward\n[m/s]"),
-        ("right_m_s", "right\n[m/s]"),
-        ("yaw_rate_deg_s", "yaw rate\n[°/s]"),
-    ):
-        lines = [_Line(getattr(flown, name), FLOWN)]
-        if estimated is not None and name != "yaw_rate_deg_s":
-            lines.append(_Line(getattr(estimated, name), ESTIMATED, "--", 0.9))
-        lines.append(_Line(held(flight.commands, name, t), COMMANDED, "-", 0.9))
-        rows.append((label, lines))
+    for name in dict.fromkeys((*ALWAYS, *flight.commands.values)):
+        lines, believed = [], getattr(estimated, name, None)
+        if (was := getattr(flown, name, None)) is not None:
+            lines.append(_Line(was, FLOWN))
+        if believed is not None and name != "yaw_rate_deg_s":
+            lines.append(_Line(believed, ESTIMATED, "--", 0.9))
+        if name in flight.commands.values:
+            lines.append(_Line(held(flight.commands, name, t), COMMANDED, "-", 0.9))
+        rows.append((LABELS[name], lines))
     lines = [_Line(flown.height_m, FLOWN)]
     if estimated is not None:
         lines.append(_Line(estimated.height_m, ESTIMATED, "--", 0.9))
@@ -112,8 +127,9 @@ def _rows(flight: TrackedFlight) -> list[tuple[str, list[_Line]]]:
         asked = np.where(t >= 0.0, flight.altitude_m, np.nan)
         lines.append(_Line(asked, COMMANDED, "-", 0.9))
     rows.append(("height\n[m]", lines))
-    tilt = [_Line(flown.roll_deg, FLOWN), _Line(flown.pitch_deg, FLOWN, ":")]
-    rows.append(("roll [°]\npitch: dotted", tilt))
+    if "roll_deg" not in flight.commands.values:
+        tilt = [_Line(flown.roll_deg, FLOWN), _Line(flown.pitch_deg, FLOWN, ":")]
+        rows.append(("roll [°]\npitch: dotted", tilt))
     if errors is not None:
         away = [_Line(errors.aside_m, ESTIMATED), _Line(errors.height_m, ESTIMATED, ":")]
         rows.append(("est. error [m]\nheight: dotted", away))
@@ -125,7 +141,7 @@ def _rows(flight: TrackedFlight) -> list[tuple[str, list[_Line]]]:
 
 def held(commands: Commands, name: str, time_s: Floats) -> Floats:
     """Return what is commanded at each time (m,): the newest setpoint; NaN before the first."""
-    values: Floats = getattr(commands, name)
+    values = commands.values[name]
     if not len(values):
         return np.full(len(time_s), np.nan)
     which = np.searchsorted(commands.sent_s, time_s, side="right") - 1

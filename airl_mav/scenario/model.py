@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, ModelWrapValidatorHandler, ValidationError, model_validator
 
+from airl_mav.core.constants import CommandKind
 from airl_mav.core.fields import ProfileModel, field_error, quantity
 from airl_mav.flight.judge import TIME_LIMIT_S, GoalRadius, TimeLimit
 from airl_mav.policy.actions import DecisionTiming
@@ -50,15 +51,25 @@ def _seed(description: str, default: Any = 1) -> Any:
     return quantity(description, "1", ge=0, le=GREATEST_SEED, default=default)
 
 
+DECISION_TIMEOUT_S = 2.0
+"""A velocity persists so long by default when no other comes [s]."""
+
+UPRIGHT_S = 0.25
+"""An attitude, or body rates, persist so long by default, beyond the hold time, before the flight
+controller is to hold the vehicle instead [s]: at 1 rad/s it has turned by 14 degrees."""
+
+
 class WatchdogSettings(ProfileModel):
     """Bounds on the silence of the policy, in simulated time."""
 
-    decision_timeout_s: float = quantity(
-        "time since the last action after which the velocity is zeroed; longer than the hold time",
+    decision_timeout_s: float | None = quantity(
+        "time since the last action after which the velocity is zeroed; longer than the hold time;"
+        f" by default {DECISION_TIMEOUT_S:g}, and {UPRIGHT_S:g} beyond the hold time for a policy"
+        " that commands attitudes or body rates",
         "s",
         ge=0.1,
         le=60,
-        default=2.0,
+        default=None,
     )
     leave_after_s: float = quantity(
         "further time after which the companion leaves offboard mode",
@@ -76,6 +87,17 @@ class WatchdogSettings(ProfileModel):
         le=60,
         default=None,
     )
+
+    def timeout_s(self, commands: CommandKind = "velocity", hold_s: float = 0.0) -> float:
+        """Return the time-out of a decision [s]: as asked for, or by default.
+
+        Args:
+            commands: What the policy commands.
+            hold_s: How long each of its actions is held [s].
+        """
+        if self.decision_timeout_s is not None:
+            return self.decision_timeout_s
+        return DECISION_TIMEOUT_S if commands == "velocity" else hold_s + UPRIGHT_S
 
 
 class LimitSettings(ProfileModel):
@@ -141,6 +163,8 @@ class PilotSettings:
     """When a decision begins: after the hold of the one before, or as soon as that is ready."""
     compensate: bool = False
     """Whether what is seen is carried forward to when the decision will act."""
+    commands: CommandKind = "velocity"
+    """What the policy commands."""
     origin: tuple[float, float, float] | None = None
     """Where the flight begins: latitude, longitude [deg], altitude [m]; None = GPS tells it."""
 

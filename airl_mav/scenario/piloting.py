@@ -48,6 +48,9 @@ def decide_piloting(
     """
     card = policy.card
     known: dict[str, Any] = {"goal_radius_m": goal_radius_m}
+    if policy.commands != "velocity":
+        # A decision with every image: nothing else keeps the vehicle level.
+        known["decisions"] = "pipelined"
     hover_s = asked.watchdog.hover_after_s
     if card is not None:
         known = {
@@ -59,28 +62,61 @@ def decide_piloting(
             "compensate": card.compensate,
         }
         hover_s = card.hover_after_s if hover_s is None else hover_s
-    names = asdict(PilotSettings())
+    names = asdict(PilotSettings()).keys() - {"commands"}
     given = {name: value for name in names if (value := getattr(asked, name)) is not None}
-    pilot = PilotSettings(**(known | given))
+    pilot = PilotSettings(commands=policy.commands, **(known | given))
     if pilot.decisions == "pipelined" and hover_s is not None:
         raise FieldError(
             "decisions", pilot.decisions, "without watchdog.hover_after_s, as no hold ends"
         )
-    timeout_s = asked.watchdog.decision_timeout_s
-    if timeout_s <= pilot.hold_s:
+    held_s = pilot.hold_s if pilot.decisions == "sequential" else 0.0
+    timeout_s = asked.watchdog.timeout_s(pilot.commands, held_s)
+    if timeout_s <= held_s:
         raise FieldError(
             "watchdog.decision_timeout_s",
             timeout_s,
             f"more than the hold time, {pilot.hold_s:g} s, or every decision is overdue",
         )
-    return pilot, asked.watchdog.model_copy(update={"hover_after_s": hover_s})
+    bounds = {"hover_after_s": hover_s, "decision_timeout_s": timeout_s}
+    return pilot, asked.watchdog.model_copy(update=bounds)
+
+
+def check_commands(
+    policy: PolicyInfo, asked: str, *, level: str, firmware: str = "builtin"
+) -> None:
+    """Raise FieldError for a policy that commands what cannot be flown so.
+
+    Args:
+        policy: What flies.
+        asked: Its name, as it was asked for.
+        level: Rung of the fidelity ladder.
+        firmware: Flight controller.
+    """
+    if policy.commands == "velocity":
+        return
+    words = policy.commands.replace("_", " ")
+    if level == "gym" and policy.commands == "attitude":
+        accepted = "at level lockstep or sitl: the batch twin flies velocities and body rates"
+    elif firmware == "ardupilot":
+        accepted = "with firmware builtin or PX4: ArduPilot takes a thrust for a climb rate"
+    else:
+        return
+    raise FieldError("policy", asked, f"one that commands {words}, {accepted}")
 
 
 def check_compensated(pilot: PilotSettings, policy: PolicyInfo, vehicle: VehicleProfile) -> None:
-    """Raise FieldError for a policy that sees by further cameras, where latency is compensated.
+    """Raise FieldError where latency is compensated that cannot be.
 
-    Their images are not carried forward.
+    That is of a policy that commands no velocity, whose effect is not foreseen, and of one that
+    sees by further cameras, whose images are not carried forward.
     """
+    if pilot.compensate and policy.commands != "velocity":
+        raise FieldError(
+            "compensate",
+            True,
+            problem=f"policy {policy.name} commands {policy.commands.replace('_', ' ')}, whose"
+            " effect is not foreseen; accepted: no compensation",
+        )
     seen: Iterable[str] = ()
     if policy.card is not None:
         seen = policy.card.observation.cameras

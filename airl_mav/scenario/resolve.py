@@ -23,6 +23,7 @@ from airl_mav.scenario.checks import (
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.piloting import (
     NATIVE_T2_US,
+    check_commands,
     check_compensated,
     check_goal_height,
     check_quota,
@@ -46,6 +47,7 @@ def resolve(scenario: Scenario) -> ResolvedScenario:
         # The companion connects to the camera by its number: it cannot be "any free one" here.
         check_ports(scenario.open_ports, any_camera=False)
     policy = find_policy(scenario.policy, trust=scenario.trust)
+    check_commands(policy, scenario.policy, level=scenario.level, firmware=scenario.firmware)
     pilot, watchdog = decide_piloting(scenario, policy, GOAL_RADIUS_M)
     vehicle, computer = equipped(scenario.vehicle, scenario.computer, scenario.payload)
     check_spread(vehicle, scenario.spread)

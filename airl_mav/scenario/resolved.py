@@ -100,6 +100,9 @@ class ResolvedScenario:
         not tell a changed one.
         """
         pilot = asdict(self.pilot)
+        if pilot["commands"] == "velocity":
+            # As it was before policies could command anything else.
+            del pilot["commands"]
         profiles: dict[str, BaseModel] = {
             "vehicle": self.vehicle,
             "arena": self.arena,

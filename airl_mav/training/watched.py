@@ -225,7 +225,7 @@ class Reflight:
 
     def __init__(self, environment: EnvironmentSpec) -> None:
         """Prepare a vehicle of the environment."""
-        self._trace = Trace(1)
+        self._trace = Trace(1, environment.action_spec.commands)
         self.navigation = Navigation(environment, 1, trace=self._trace)
         self._environment = environment
 

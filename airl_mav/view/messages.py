@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from airl_mav.arena.appearance import Statics
 from airl_mav.arena.geometry import Arena, Bounds, Building, Obstacles, PlacedMesh, Tour
 from airl_mav.arena.ground import Ground
+from airl_mav.core.constants import CommandKind
 from airl_mav.core.goals import Goal
 from airl_mav.profiles.appearance import DEFAULT, Appearance
 from airl_mav.profiles.mesh_file import MeshFile
@@ -288,7 +289,9 @@ class Decided(Message):
     expires_us: int | None
     """When the vehicle is told to hover if no other has come; None: never."""
     setpoint: Quaternion
-    """Velocity forward, right, down [m/s] in the heading frame, yaw rate [rad/s]."""
+    """Velocity forward, right, down [m/s] in the heading frame, yaw rate [rad/s]; or, by
+    `commands`, as `policy.actions.Attitude` or `BodyRates`."""
+    commands: CommandKind = "velocity"
     compensated: bool
     """Whether the policy saw what was expected, not what was."""
     shape: Shape

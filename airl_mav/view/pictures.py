@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from airl_mav.camera.frame import nearness, rgb_of
 from airl_mav.core.constants import US_PER_S
-from airl_mav.view.messages import Image
+from airl_mav.view.messages import Decided, Image
 from airl_mav.view.shown import Shown
 from airl_mav.view.viridis import VIRIDIS
 
@@ -70,11 +70,7 @@ def numbers_html(shown: Shown) -> str:
         ]
     acts, then, how = NOTHING, NOTHING, ""
     if decided is not None and shown.flies_setpoints:
-        # Added to zero, so that a rounded zero has no sign of its own.
-        forward, right, down = (round(number, 1) + 0.0 for number in decided.setpoint[:3])
-        turn = round(math.degrees(decided.setpoint[3])) + 0
-        acts = f"{forward:+.1f} forward, {right:+.1f} right,"
-        then = f"{down:+.1f} down [m/s], {turn:+d} °/s"
+        acts, then = _setpoint(decided)
         how = ", compensated" if decided.compensated else ""
     rows += [
         ("action", acts),
@@ -83,6 +79,22 @@ def numbers_html(shown: Shown) -> str:
         ("t2", _number(shown.t2_ms, "{:.0f} ms") + how),
     ]
     return _table(rows)
+
+
+def _setpoint(decided: Decided) -> tuple[str, str]:
+    """Return what was decided, in two lines."""
+    # Added to zero, so that a rounded zero has no sign of its own.
+    if decided.commands == "velocity":
+        forward, right, down = (round(number, 1) + 0.0 for number in decided.setpoint[:3])
+        turn = round(math.degrees(decided.setpoint[3])) + 0
+        return (
+            f"{forward:+.1f} forward, {right:+.1f} right,",
+            f"{down:+.1f} down [m/s], {turn:+d} °/s",
+        )
+    roll, pitch, yaw = (round(math.degrees(number)) + 0 for number in decided.setpoint[:3])
+    unit = "°/s" if decided.commands == "body_rates" else "°"
+    thrust = f"thrust {decided.setpoint[3]:.2f}"
+    return f"roll {roll:+d}, pitch {pitch:+d},", f"yaw {yaw:+d} {unit}, {thrust}"
 
 
 def title_html(shown: Shown, run: str) -> str:

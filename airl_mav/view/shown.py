@@ -138,6 +138,8 @@ class Shown:
         """The velocity that is commanded (3,): forward, right, down [m/s]; None: nobody does."""
         if self.decided is None or self.vehicle is None or not self.flies_setpoints:
             return None
+        if self.decided.commands != "velocity":
+            return None
         expires_us = self.decided.expires_us
         if expires_us is not None and self.vehicle.time_us >= expires_us:
             return np.zeros(3)

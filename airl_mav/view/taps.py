@@ -127,14 +127,15 @@ class CompanionTap:
 
     def decided(self, decision: Decision) -> None:
         """A decision was sent."""
-        forward, right, down, turn = (float(number) for number in decision.setpoint)
+        first, second, third, fourth = (float(number) for number in decision.setpoint)
         shown = Decided(
             captured_us=decision.seen.frame.capture_time_us,
             began_us=decision.started_us,
             ready_us=decision.ready_us,
             sent_us=decision.sent_us,
             expires_us=decision.expires_us,
-            setpoint=(forward, right, down, turn),
+            setpoint=(first, second, third, fourth),
+            commands=self._scenario.pilot.commands,
             compensated=self._scenario.vehicle.compensable and self._hand.compensates(),
             shape=shape_of(decision.image),
         )

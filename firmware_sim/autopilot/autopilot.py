@@ -12,6 +12,7 @@ from airl_mav.core.constants import TICK_HZ, TICK_S
 from airl_mav.core.frames import Geodetic
 from firmware_sim.autopilot.auto_disarm import AutoDisarm
 from firmware_sim.autopilot.autopilot_state import (
+    UNTOLD,
     WITH_STICKS,
     AutopilotState,
     Message,
@@ -19,6 +20,7 @@ from firmware_sim.autopilot.autopilot_state import (
     Result,
     Setpoint,
     Severity,
+    Wire,
 )
 from firmware_sim.autopilot.commander import (
     COMMANDED,
@@ -131,8 +133,8 @@ class BuiltinAutopilot:
         """What makes parts fail at a client's word; set by whoever simulates them."""
         self.logs: LogStore = NoLogs()
         """Where clients find the flight logs; whoever writes them sets it."""
-        self.on_setpoint: Callable[[Setpoint, int], None] | None = None
-        """Called with every accepted setpoint and its time of receipt, if set."""
+        self.on_setpoint: Callable[[Wire, int], None] | None = None
+        """Called with every accepted setpoint, as received, and its time of receipt, if set."""
         self.on_message: Callable[[Message], None] | None = None
         """Called with every text for the operator, if set."""
         self._say_all(parameters.take_texts())
@@ -254,7 +256,10 @@ class BuiltinAutopilot:
     @property
     def ticks_to_motors(self) -> int:
         """After how many more ticks the motors reflect what is demanded in the next one."""
-        return self._controller.ticks_to_motors
+        ticks, wanted = self._controller.ticks_to_motors, self._guidance.context.setpoint
+        if isinstance(wanted, RateDemand):
+            return 0
+        return min(1, ticks) if isinstance(wanted, AttitudeDemand) else ticks
 
     @property
     def internals(self) -> BuiltinAutopilot:
@@ -393,12 +398,16 @@ class BuiltinAutopilot:
         self._guidance.context.setpoint = setpoint
         self.supervisor.setpoint(setpoint, time_us)
         if self.on_setpoint is not None:
-            self.on_setpoint(setpoint, time_us)
+            self.on_setpoint(setpoint.wire, time_us)
 
-    def offer_attitude(self, demand: AttitudeDemand | RateDemand, time_us: int) -> None:
+    def offer_attitude(
+        self, demand: AttitudeDemand | RateDemand, time_us: int, wire: Wire = UNTOLD
+    ) -> None:
         """Hand over an offboard setpoint of attitude or body rates, received at `time_us`."""
         self._guidance.context.setpoint = demand
         self.supervisor.setpoint(None, time_us)
+        if self.on_setpoint is not None:
+            self.on_setpoint(wire, time_us)
 
     def refuse_setpoint(self, reason: str, time_us: int) -> None:
         """Note why an offboard setpoint was refused: the failsafe that follows names it."""

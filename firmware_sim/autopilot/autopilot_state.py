@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -139,6 +139,14 @@ class Result(IntEnum):
     CANCELLED = 6
 
 
+Wire: TypeAlias = "tuple[float, float, float, float]"
+"""Four numbers of an offboard setpoint exactly as received: what latency analysis recognises a
+message by."""
+
+UNTOLD: Wire = (math.nan, math.nan, math.nan, math.nan)
+"""Of a setpoint that no message brought."""
+
+
 class Setpoint(NamedTuple):
     """An offboard setpoint, already in local NED. NaN = not commanded on that axis."""
 
@@ -148,9 +156,8 @@ class Setpoint(NamedTuple):
     """Heading [rad]."""
     yaw_rate: float
     """[rad/s], positive clockwise seen from above."""
-    wire: tuple[float, float, float, float] = (math.nan, math.nan, math.nan, math.nan)
-    """Velocity and yaw rate (or yaw, where no rate is commanded) exactly as received: what latency
-    analysis recognises a message by."""
+    wire: Wire = UNTOLD
+    """Velocity and yaw rate (or yaw, where no rate is commanded)."""
     acceleration: Vector = np.full(3, math.nan)  # (3,) NED [m/s²]
 
 

@@ -10,7 +10,15 @@ from airl_mav.control.demand import AttitudeDemand, RateDemand
 from airl_mav.core.frames import Geodetic
 from airl_mav.faults.kinds import Part
 from airl_mav.faults.model import Fault
-from firmware_sim.autopilot.autopilot_state import AutopilotState, Message, Mode, Result, Setpoint
+from firmware_sim.autopilot.autopilot_state import (
+    UNTOLD,
+    AutopilotState,
+    Message,
+    Mode,
+    Result,
+    Setpoint,
+    Wire,
+)
 from firmware_sim.autopilot.events.definition import Event
 from firmware_sim.autopilot.manual_control import Source, Sticks
 from firmware_sim.autopilot.navigation.plan import Plans
@@ -237,8 +245,14 @@ class AutopilotPort(Protocol):
         """Hand over a valid offboard setpoint, received at `time_us` of simulated time."""
         ...
 
-    def offer_attitude(self, demand: AttitudeDemand | RateDemand, time_us: int) -> None:
-        """Hand over an offboard setpoint of attitude or body rates, received at `time_us`."""
+    def offer_attitude(
+        self, demand: AttitudeDemand | RateDemand, time_us: int, wire: Wire = UNTOLD
+    ) -> None:
+        """Hand over an offboard setpoint of attitude or body rates, received at `time_us`.
+
+        `wire` is what latency analysis recognises it by: roll, pitch, yaw [rad] or their rates
+        [rad/s], and the thrust.
+        """
         ...
 
     def refuse_setpoint(self, reason: str, time_us: int) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from airl_mav.core.constants import US_PER_S
-from firmware_sim.autopilot.autopilot_state import Mode, Result, Setpoint, Severity
+from firmware_sim.autopilot.autopilot_state import Mode, Result, Severity, Wire
 from firmware_sim.autopilot.commander import Phase
 from firmware_sim.autopilot.failsafes.supervisor import LOOK_US
 from firmware_sim.interfaces import ActuatorControls, SensorSample
@@ -62,7 +62,7 @@ def under_way(rig: Rig, seconds: float = 4.0) -> int:
     accepted = rig.ap.on_setpoint
     assert accepted is not None
 
-    def note(setpoint: Setpoint, time_us: int) -> None:
+    def note(setpoint: Wire, time_us: int) -> None:
         offered.append(time_us)
         accepted(setpoint, time_us)
 

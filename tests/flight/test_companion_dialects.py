@@ -75,12 +75,12 @@ def test_a_flight_on_ardupilot() -> None:
         assert -stage.simulation.truth.position[2] == pytest.approx(3.0, abs=0.7)
 
         link.enter_offboard()
-        link.set_velocity_body(BodyVelocity(1.5, 0.0, 0.0, 0.0))
+        link.send_setpoint(BodyVelocity(1.5, 0.0, 0.0, 0.0))
         until(lambda: stage.simulation.truth.velocity[0] > 1.3, link)
         until(lambda: link.kinematics().velocity[0] > 1.3, link)
-        link.set_velocity_body(BodyVelocity(0.0, 1.0, 0.0, math.radians(20.0)))
+        link.send_setpoint(BodyVelocity(0.0, 1.0, 0.0, math.radians(20.0)))
         until(lambda: stage.simulation.truth.velocity[1] > 0.6, link)
-        link.set_velocity_body(STOP)
+        link.send_setpoint(STOP)
         until(lambda: math.hypot(*stage.simulation.truth.velocity[:2]) < 0.1, link)
         link.leave_offboard()
         assert copter.mode == BRAKE

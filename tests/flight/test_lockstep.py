@@ -256,7 +256,7 @@ def airborne(stage: Stage) -> None:
 
 def companion_dies(stage: Stage) -> None:
     airborne(stage)
-    stage.link.set_velocity_body(BodyVelocity(1.0, 0.0, 0.0, 0.3))
+    stage.link.send_setpoint(BodyVelocity(1.0, 0.0, 0.0, 0.3))
 
 
 def policy_hangs(stage: Stage) -> None:
@@ -288,7 +288,7 @@ def nobody_takes_off(stage: Stage) -> None:
 def battery_runs_low(stage: Stage) -> None:
     airborne(stage)
     for _ in range(120):
-        stage.link.set_velocity_body(BodyVelocity(0.5, 0.0, 0.0, 0.0))
+        stage.link.send_setpoint(BodyVelocity(0.5, 0.0, 0.0, 0.0))
         stage.clock.sleep_until(stage.clock.time_us() + US_PER_S // 10)
 
 

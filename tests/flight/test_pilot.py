@@ -26,7 +26,7 @@ from airl_mav.policy.observation import Kinematics, Observation
 from airl_mav.scenario.model import PilotSettings, WatchdogSettings
 from companion.camera import ReceivedFrame
 from companion.guard import ThreadGuard
-from companion.interfaces import STOP, BodyVelocity, LinkError, VehicleStatus
+from companion.interfaces import STOP, BodyVelocity, LinkError, Setpoint, VehicleStatus
 from companion.pilot import Pilot
 from companion.watchdog import Watchdog
 
@@ -55,7 +55,8 @@ class FakeLink:
     def status(self) -> VehicleStatus:
         return self.flown
 
-    def set_velocity_body(self, setpoint: BodyVelocity) -> None:
+    def send_setpoint(self, setpoint: Setpoint) -> None:
+        assert isinstance(setpoint, BodyVelocity)
         if self.refuse is not None:
             raise LinkError(self.refuse)
         self.commands.append((self._clock.time_us(), setpoint))

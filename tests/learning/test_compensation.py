@@ -39,7 +39,7 @@ from airl_mav.scenario.model import LevelName, PilotSettings, Scenario, Watchdog
 from airl_mav.scenario.resolve import resolve
 from airl_mav.scenario.stand_alone import StandAloneCompanion
 from companion.camera import ReceivedFrame
-from companion.interfaces import BodyVelocity, VehicleStatus
+from companion.interfaces import BodyVelocity, Setpoint, VehicleStatus
 from companion.pilot import Pilot
 from companion.program import prepare
 from companion.watchdog import Watchdog
@@ -117,7 +117,8 @@ class World:
             fleet.position[0].copy(), fleet.velocity[0].copy(), fleet.quaternion[0].copy()
         )
 
-    def set_velocity_body(self, setpoint: BodyVelocity) -> None:
+    def send_setpoint(self, setpoint: Setpoint) -> None:
+        assert isinstance(setpoint, BodyVelocity)
         self._catch_up()
         self._due.append((self._tick + self._link_ticks, setpoint))
         self._accept()

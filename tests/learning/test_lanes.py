@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.generate import generate
 from airl_mav.control.attitude import heading_of
-from airl_mav.control.cascade import Filters, cascade_tick, filters
-from airl_mav.control.demand import Demand
+from airl_mav.control.cascade import Filters, cascade_tick, filters, rate_tick
+from airl_mav.control.demand import Demand, RateDemand
 from airl_mav.control.gains import Gains
 from airl_mav.core.constants import TICK_S, TICK_US
 from airl_mav.core.kernels import kernel
@@ -61,17 +61,24 @@ def fly_alone(
             fleet.quaternion[i, 3],
         )
         w = (fleet.omega[i, 0], fleet.omega[i, 1], fleet.omega[i, 2])
-        if fleet.time_us[i] >= fleet.repeat_us[i]:
+        if fleet.time_us[i] >= fleet.repeat_us[i] and fleet.by_rates[i]:
+            fleet.repeat_us[i] += REPEAT_US
+        elif fleet.time_us[i] >= fleet.repeat_us[i]:
             c, s = heading_of(q)
             forward, right = fleet.setpoint[i, 0], fleet.setpoint[i, 1]
             fleet.velocity_ned[i, 0] = c * forward - s * right
             fleet.velocity_ned[i, 1] = s * forward + c * right
             fleet.velocity_ned[i, 2] = fleet.setpoint[i, 2]
             fleet.repeat_us[i] += REPEAT_US
-        n = fleet.velocity_ned[i]
-        demand = Demand(NAN3, (n[0], n[1], n[2]), math.nan, fleet.setpoint[i, 3])
         memory = fleet.memory[i]
-        motors = cascade_tick(p, v, q, w, demand, memory, gains, weights, TICK_S).motors
+        if fleet.by_rates[i]:
+            s = fleet.setpoint[i]
+            rates = RateDemand((s[0], s[1], s[2]), s[3])
+            motors = rate_tick(v, q, w, rates, memory, gains, weights, TICK_S).motors
+        else:
+            n = fleet.velocity_ned[i]
+            demand = Demand(NAN3, (n[0], n[1], n[2]), math.nan, fleet.setpoint[i, 3])
+            motors = cascade_tick(p, v, q, w, demand, memory, gains, weights, TICK_S).motors
         for k in range(4):
             fleet.rotor[i, k] = settle(
                 fleet.rotor[i, k], motors[k], airframe, lag(airframe, TICK_S)
@@ -115,16 +122,28 @@ def arenas_of(n: int, name: str) -> ArenaBatch:
     return batch_of([generate(spec, s, name=name, vehicle_width_m=width_m) for s in range(n)])
 
 
-def commanded(fleet: Fleet, rng: np.random.Generator) -> None:
-    """Setpoints that saturate motors now and then: full speed to and fro, fast turns."""
-    fleet.setpoint[:] = rng.uniform([-12, -12, -3, -3], [12, 12, 1, 3], (len(fleet.time_us), 4))
+def commanded(fleet: Fleet, rng: np.random.Generator, by_rates: float = 0.0) -> None:
+    """Setpoints that saturate motors now and then: full speed to and fro, fast turns.
+
+    A share of them, on average, is of body rates and thrust.
+    """
+    n = len(fleet.time_us)
+    fleet.setpoint[:] = rng.uniform([-12, -12, -3, -3], [12, 12, 1, 3], (n, 4))
     fleet.repeat_us[:] = fleet.time_us
+    if by_rates > 0.0:
+        fleet.by_rates[:] = rng.random(n) < by_rates
+        rates = rng.uniform([-4, -4, -2, 0.2], [4, 4, 2, 0.9], (n, 4))
+        fleet.setpoint[fleet.by_rates] = rates[fleet.by_rates]
 
 
 @pytest.mark.parametrize("n", [1, LANES, 3 * LANES + 1])
 @pytest.mark.parametrize("windy", [False, True])
-def test_together_as_alone(n: int, windy: bool) -> None:
-    """Of unequal vehicles, for unequal numbers of ticks, from unequal moments on."""
+@pytest.mark.parametrize("by_rates", [0.0, 0.5, 1.0])
+def test_together_as_alone(n: int, windy: bool, by_rates: float) -> None:
+    """Of unequal vehicles, for unequal numbers of ticks, from unequal moments on.
+
+    Commanded by velocities, by body rates, or by one after the other.
+    """
     rng = np.random.default_rng(n)
     air = rng.normal(0.0, 4.0, (n, 7, 3)) if windy else np.zeros((n, 1, 3))
     fleet, alone = fleet_of(n, rng), fleet_of(n, np.random.default_rng(n + 1))
@@ -137,8 +156,9 @@ def test_together_as_alone(n: int, windy: bool) -> None:
     weights = filters(VEHICLE.gains, TICK_S)
     never = Rules(goal_radius=0.0, time_limit_us=10**12)
     for _ in range(40):
-        commanded(fleet, rng)
+        commanded(fleet, rng, by_rates)
         alone.setpoint[:], alone.repeat_us[:] = fleet.setpoint, fleet.repeat_us
+        alone.by_rates[:] = fleet.by_rates
         ticks = rng.integers(0, 12, n)
         advance(fleet, far_off, ticks, VEHICLE, never, air if windy else None)
         for i in range(n):
@@ -196,7 +216,8 @@ def test_neither_order_nor_company_matters(arena: str) -> None:
 
 
 @pytest.mark.parametrize("arena", ["no-obstacles", "dynamic-obstacles"])
-def test_legs_are_flights_one_after_the_other(arena: str) -> None:
+@pytest.mark.parametrize("share", [0.0, 0.3])
+def test_legs_are_flights_one_after_the_other(arena: str, share: float) -> None:
     """With the setpoint between them, and the pose for the camera; also where a flight ends."""
     n = 5 * LANES + 2
     at_once, parts = (fleet_of(n, np.random.default_rng(2)) for _ in range(2))
@@ -205,17 +226,18 @@ def test_legs_are_flights_one_after_the_other(arena: str) -> None:
         setpoints = rng.uniform([0, -4, -0.3, -2], [8, 4, 0.3, 2], (n, 4))
         ticks = rng.integers([1, 0, 0], [12, 9, 9], (n, 3))
         flies = at_once.verdict == Verdict.FLYING
-        legs = Legs(ticks, setpoints, np.zeros(n, np.int64), np.zeros((n, 3)), np.zeros((n, 4)))
+        by_rates = rng.random(n) < share
+        setpoints[by_rates] = (0.2, -0.1, 0.3, 0.5) * setpoints[by_rates] + (0.0, 0.0, 0.0, 0.5)
+        seen = np.zeros(n, np.int64), np.zeros((n, 3)), np.zeros((n, 4))
+        legs = Legs(ticks, setpoints, by_rates, *seen)
         advance(at_once, arenas, ticks.sum(axis=1), VEHICLE, RULES, None, legs)
         for k in range(3):
             before = parts.verdict.copy()
             advance(parts, arenas, ticks[:, k].copy(), VEHICLE, RULES, None)
             ended[k] += (parts.verdict != before).sum()
             if k == 0:
-                parts.setpoint[flies], parts.repeat_us[flies] = (
-                    setpoints[flies],
-                    parts.time_us[flies],
-                )
+                parts.setpoint[flies], parts.by_rates[flies] = setpoints[flies], by_rates[flies]
+                parts.repeat_us[flies] = parts.time_us[flies]
             elif k == 1:
                 for name in ("time_us", "position", "quaternion"):
                     seen = getattr(legs, f"seen_{name.removeprefix('time_')}")

@@ -34,7 +34,7 @@ from airl_mav.profiles.parameters import parameter_values
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.model import PilotSettings, WatchdogSettings
 from companion.camera import ReceivedFrame
-from companion.interfaces import BodyVelocity, VehicleStatus
+from companion.interfaces import Setpoint, VehicleStatus
 from companion.pilot import Pilot
 from companion.watchdog import Watchdog
 
@@ -233,7 +233,7 @@ class StillLink:
     def kinematics(self) -> Kinematics:
         return Kinematics(np.array([0.0, 0.0, -2.5]), np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
 
-    def set_velocity_body(self, setpoint: BodyVelocity) -> None:
+    def send_setpoint(self, setpoint: Setpoint) -> None:
         """Stands."""
 
     def leave_offboard(self) -> None:

@@ -17,6 +17,7 @@ from airl_mav.core.constants import GRAVITY_M_S2, TICK_S, TICK_US, US_PER_S
 from airl_mav.core.frames import Geodetic, local_to_geodetic, quat_from_euler, wrap_pi
 from airl_mav.profiles.parameters import SPECS
 from firmware_sim.autopilot.autopilot_state import (
+    UNTOLD,
     Arming,
     Clearance,
     CommanderStatus,
@@ -32,6 +33,7 @@ from firmware_sim.autopilot.autopilot_state import (
     Setpoint,
     Severity,
     Vector,
+    Wire,
 )
 from firmware_sim.autopilot.events.definition import Event
 from firmware_sim.autopilot.manual_control import Source, Sticks
@@ -197,6 +199,7 @@ class KinematicAutopilot:
         self.landing_targets: list[LandingTarget] = []
         self.followed: list[FollowedTarget] = []
         self.attitudes: list[tuple[AttitudeDemand | RateDemand, int]] = []
+        self.wires: list[Wire] = []
         self.refusals: list[tuple[str, int]] = []
         self.messages: list[Message] = []
         self.events: list[Event] = []
@@ -293,8 +296,11 @@ class KinematicAutopilot:
     def offer_setpoint(self, setpoint: Setpoint, time_us: int) -> None:
         self.setpoints.append((setpoint, time_us))
 
-    def offer_attitude(self, demand: AttitudeDemand | RateDemand, time_us: int) -> None:
+    def offer_attitude(
+        self, demand: AttitudeDemand | RateDemand, time_us: int, wire: Wire = UNTOLD
+    ) -> None:
         self.attitudes.append((demand, time_us))
+        self.wires.append(wire)
 
     def refuse_setpoint(self, reason: str, time_us: int) -> None:
         self.refusals.append((reason, time_us))

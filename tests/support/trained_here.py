@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from airl_mav.policy.actions import Action
+from airl_mav.policy.actions import AnyAction
 from airl_mav.policy.learned import LearnedPolicy
 from airl_mav.policy.observation import Observation
 from tests.support.command_line import airl
@@ -16,7 +16,7 @@ class Watching:
     def __init__(self, policy: LearnedPolicy, seen: list[Observation]) -> None:
         self._policy, self._seen = policy, seen
 
-    def act(self, observation: Observation) -> Action:
+    def act(self, observation: Observation) -> AnyAction:
         self._seen.append(observation)
         return self._policy.act(observation)
 

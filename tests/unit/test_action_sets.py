@@ -12,7 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from airl_mav.policy.action_sets import ActionSpec, command, commands, discrete_actions
+from airl_mav.policy.action_sets import ActionSpec, commands, discrete_actions
+from airl_mav.policy.action_sets import command as any_command
 from airl_mav.policy.actions import Action, limited
 
 DISCRETE = ["arc-25", "paper-25"]
@@ -20,6 +21,13 @@ DISCRETE = ["arc-25", "paper-25"]
 
 def spec(name: str, max_speed_m_s: float = 5.0) -> ActionSpec:
     return ActionSpec.model_validate({"set": name, "max_speed_m_s": max_speed_m_s})
+
+
+def command(asked: ActionSpec, action: np.ndarray) -> Action:
+    """Return the velocity that one action commands."""
+    found = any_command(asked, action)
+    assert isinstance(found, Action)
+    return found
 
 
 def table(name: str, max_speed_m_s: float = 5.0) -> np.ndarray:

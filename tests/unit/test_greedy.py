@@ -412,12 +412,15 @@ def test_policies_are_found_by_name() -> None:
     for name in POLICIES:
         assert find_policy(name).description
         action = load_policy(name, 0.5).act(blank((10.0, 0.0)))
+        assert isinstance(action, Action)
         assert action.forward_m_s > 0.0
 
 
 def test_a_longer_hold_makes_greedy_slower_before_an_obstacle() -> None:
     scene = look(arena((6.0, 0.0, 1.0, 40.0)), (30.0, 0.0))
     quick, slow = (load_policy("greedy", hold_s).act(scene) for hold_s in (0.1, 1.0))
+    assert isinstance(slow, Action)
+    assert isinstance(quick, Action)
     assert slow.forward_m_s < quick.forward_m_s
 
 

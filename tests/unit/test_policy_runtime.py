@@ -26,6 +26,7 @@ from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.policy import learned, registry
 from airl_mav.policy.action_sets import ActionSpec, commands
+from airl_mav.policy.actions import Action
 from airl_mav.policy.card import CARD_FILE, PolicyCard, read_card
 from airl_mav.policy.card_writing import write_card
 from airl_mav.policy.layouts import encode_layout
@@ -161,6 +162,7 @@ def test_one_decision_is_the_networks_best_score(exported: Path) -> None:
     scores = runtime.infer(encode_layout(SPEC, batch))
     forward, right, turn = commands(ActionSpec(), np.array([int(np.argmax(scores))]))[0]
     action = policy.act(seen)
+    assert isinstance(action, Action)
     assert (action.forward_m_s, action.right_m_s, action.yaw_rate_rad_s) == (forward, right, turn)
 
 

@@ -12,7 +12,7 @@ from airl_mav.black_box.messages import Decision
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.goals import goal_distance_m
 from airl_mav.flight.trajectory import Trajectory, pose_at
-from airl_mav.latency.stamps import NO_STAMP, STAMPS
+from airl_mav.latency.stamps import NO_STAMP, SETPOINT, SETPOINTS, STAMPS, setpoint_column
 from airl_mav.rehearsal.run_folder import RunInfo
 from airl_mav.report.replay.flight import ReplayedFlight
 from airl_mav.vehicle.battery import drain, open_circuit, terminal_voltage
@@ -56,7 +56,7 @@ class RecordedFlight:
         stamps = self.replayed.stamps
         columns = {
             name: stamps[name]
-            for name in (*STAMPS, "setpoint", "accepted_us", "motor_us")
+            for name in (*STAMPS, *SETPOINTS.values(), "accepted_us", "motor_us")
             if name in stamps
         }
         sent = columns.get("sent_us", np.zeros(0, np.int64)) != NO_STAMP
@@ -110,9 +110,10 @@ def decision_messages(flight: RecordedFlight) -> list[Decision]:
     The state that a decision saw is that of the moment at which its inference began.
     """
     columns, believed = flight.decisions, flight.believed
+    setpoints = columns.get(setpoint_column(columns) or SETPOINT, np.zeros((0, 4)))
     goal = flight.replayed.record.goal
     held_before_us, found = NO_STAMP, []
-    for i in range(len(columns.get("sent_us", ()))):
+    for i in range(len(setpoints)):
         stamps = {name: int(columns[name][i]) for name in STAMPS}
         position, velocity, quaternion = pose_at(believed, stamps["infer_start_us"])
         found.append(
@@ -123,7 +124,7 @@ def decision_messages(flight: RecordedFlight) -> list[Decision]:
                 velocity=tuple(velocity.tolist()),
                 quaternion=tuple(quaternion.tolist()),
                 goal_away_m=goal_distance_m(goal, position),
-                setpoint=tuple(columns["setpoint"][i].astype(float).tolist()),
+                setpoint=tuple(setpoints[i].astype(float).tolist()),
             )
         )
         held_before_us = stamps["held_until_us"]

@@ -38,7 +38,7 @@ from airl_mav.core.frames import frd_to_flu, quat_flu_from_optical
 from airl_mav.flight.smoothness import commanded_velocity
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.stages import stage_durations
-from airl_mav.latency.stamps import NO_STAMP
+from airl_mav.latency.stamps import NO_STAMP, SETPOINT
 from airl_mav.profiles.camera_kind import CameraKind
 from airl_mav.report.export_log.foxglove_types import (
     CAMERA,
@@ -272,11 +272,11 @@ class FlightMessages:
 
     def _commanded(self) -> Iterator[Told]:
         columns = self.flight.decisions
-        if not len(columns.get("sent_us", ())):
-            return
+        if not len(columns.get(SETPOINT, ())):
+            return  # no velocity is commanded
         velocities = self._commands(self._path.time_us)
         which = np.searchsorted(columns["sent_us"], self._path.time_us, side="right") - 1
-        rates = np.where(which < 0, 0.0, columns["setpoint"][np.maximum(which, 0), 3])
+        rates = np.where(which < 0, 0.0, columns[SETPOINT][np.maximum(which, 0), 3])
         for i, time_us in enumerate(self._path.time_us.tolist()):
             if self.flight.navigates(time_us):
                 command = Command(time_us, tuple(velocities[i].tolist()), float(rates[i]))

@@ -17,6 +17,7 @@ import numpy as np
 from airl_mav.core.frames import quats_to_euler
 from airl_mav.flight.smoothness import commanded_velocity
 from airl_mav.flight.trajectory import Trajectory
+from airl_mav.latency.stamps import SETPOINT
 from airl_mav.report.export_log.recorded import RecordedFlight, charge_of
 from airl_mav.report.replay.flight import INFO, STANDING_M, WARNING
 from firmware_sim.autopilot.autopilot_state import Mode
@@ -152,8 +153,8 @@ def _motion(path: Trajectory, suffix: str) -> Iterator[Sample]:
 def _setpoints(flight: RecordedFlight) -> Iterator[Sample]:
     """Give the commanded velocity, NED, and yaw rate, while the policy flies."""
     columns, path = flight.decisions, flight.replayed.path
-    if not len(columns.get("sent_us", ())):
-        return
+    if not len(columns.get(SETPOINT, ())):
+        return  # no velocity is commanded
     velocities = commanded_velocity(path, columns, path.time_us)
     which = np.searchsorted(columns["sent_us"], path.time_us, side="right") - 1
     tracked = "vehicle_local_position_setpoint"
@@ -165,7 +166,7 @@ def _setpoints(flight: RecordedFlight) -> Iterator[Sample]:
             time_us = int(path.time_us[i])
             if which[i] < 0 or not flight.navigates(time_us):
                 continue
-            turn = float(columns["setpoint"][which[i], 3])
+            turn = float(columns[SETPOINT][which[i], 3])
             velocity = velocities[i].tolist()
             if name == tracked:
                 speeds = dict(zip(("vx", "vy", "vz"), velocity, strict=True))

@@ -14,6 +14,7 @@ from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.files import Arrays
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory, pose_at
+from airl_mav.latency.stamps import SETPOINT, commanded, setpoint_column
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.view.messages import (
     ArenaShown,
@@ -174,7 +175,8 @@ class ReplayedFlight:
             int(self.stamps[name][number])
             for name in ("capture_us", "infer_start_us", "action_ready_us", "sent_us")
         )
-        forward, right, down, turn = (float(part) for part in self.stamps["setpoint"][number])
+        column = setpoint_column(self.stamps) or SETPOINT
+        first, second, third, fourth = (float(part) for part in self.stamps[column][number])
         image = self.image(captured_us)
         shown.decided_image, shown.decisions = image, number + 1
         shown.decided = Decided(
@@ -183,7 +185,8 @@ class ReplayedFlight:
             ready_us=ready_us,
             sent_us=sent_us,
             expires_us=None,
-            setpoint=(forward, right, down, turn),
+            setpoint=(first, second, third, fourth),
+            commands=commanded(self.stamps),
             compensated=self.compensated,
             shape=(1, 1) if image is None else shape_of(image),
         )
@@ -215,9 +218,10 @@ def parting_s(first: ReplayedFlight, other: ReplayedFlight) -> float | None:
 
     That is the exposure of its image in the first flight; None: no decision differs.
     """
-    ours, theirs = first.stamps.get("setpoint"), other.stamps.get("setpoint")
-    if ours is None or theirs is None:
+    column = setpoint_column(first.stamps)
+    if column is None or column not in other.stamps:
         return None
+    ours, theirs = first.stamps[column], other.stamps[column]
     shared = min(len(ours), len(theirs))
     differ = np.abs(ours[:shared] - theirs[:shared]).max(axis=1, initial=0.0) > PARTED
     number = int(np.argmax(differ)) if differ.any() else shared

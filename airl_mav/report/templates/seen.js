@@ -26,8 +26,12 @@ function makeSeen(palette, goTo) {
     }
     canvas.getContext("2d").putImageData(image, 0, 0);
     const { sent, taken } = decisions[seen.number];
-    const [forward, right, turn] = ["forward_m_s", "right_m_s", "yaw_rate_deg_s"].map((key) => numbers(flight.commands[key])[seen.number]);
-    told.textContent = `Decision ${seen.number + 1} of ${decisions.length}: frame of ${taken.toFixed(2)} s, sent at ${sent.toFixed(2)} s: ${action(forward, right, turn)}`;
+    const keys = Object.keys(flight.commands).filter((key) => key !== "sent");
+    const chosen = keys.map((key) => numbers(flight.commands[key])[seen.number]);
+    const [forward, right, turn] = chosen;
+    const words = keys.includes("forward_m_s") ? action(forward, right, turn)
+      : keys.map((key, i) => `${TITLES[key].split(/[,[]/)[0].trim()} ${key === "thrust" ? chosen[i].toFixed(2) : signed(chosen[i], 0)}`).join(", ");
+    told.textContent = `Decision ${seen.number + 1} of ${decisions.length}: frame of ${taken.toFixed(2)} s, sent at ${sent.toFixed(2)} s: ${words}`;
     list.replaceChildren();
     box.classList.toggle("scored", Boolean(seen.best));
     const asked = (row) => Math.abs(row[1] - forward) + Math.abs(row[2] - right) + Math.abs(row[3] * 180 / Math.PI - turn) < 0.5;

@@ -5,6 +5,12 @@ function numbers({ unit, steps }) {
 }
 const COLOURS = { commanded: "#cf6a12", flown: "#2f7fc4", estimated: "#2c9a5b", other: "#a35bb8" };
 
+const TITLES = {
+  forward_m_s: "velocity forward [m/s]", right_m_s: "velocity right [m/s]", yaw_rate_deg_s: "yaw rate, clockwise [°/s]",
+  roll_deg: "roll [°]", pitch_deg: "pitch [°]", heading_deg: "heading [°]", thrust: "thrust, 0 to 1",
+  body_roll_rate_deg_s: "roll rate [°/s]", body_pitch_rate_deg_s: "pitch rate [°/s]", body_yaw_rate_deg_s: "yaw rate of the body [°/s]",
+};
+
 // When each decision's frame was taken, and when its command moved the motors [s].
 function spans(flight) {
   const sent = numbers(flight.commands.sent);
@@ -37,17 +43,17 @@ function makeTracks(goTo) {
       line(numbers(flight.flown[key]), "flown", COLOURS.flown),
       ...(estimated && flight.estimated ? [line(numbers(flight.estimated[key]), "estimated", COLOURS.estimated, { dash: "dash", width: 1.2 })] : []),
     ];
-    const list = [
-      ["velocity forward [m/s]", [...both("forward_m_s"), ...held("forward_m_s")]],
-      ["velocity right [m/s]", [...both("right_m_s"), ...held("right_m_s")]],
-      ["yaw rate, clockwise [°/s]", [...both("yaw_rate_deg_s", false), ...held("yaw_rate_deg_s")]],
-    ];
+    const commanded = Object.keys(flight.commands).filter((key) => key !== "sent");
+    const list = [...new Set(["forward_m_s", "right_m_s", ...commanded])].map((key) => [TITLES[key], [
+      ...(flight.flown[key] ? both(key, key !== "yaw_rate_deg_s" && Boolean(flight.estimated?.[key])) : []),
+      ...(flight.commands[key] ? held(key) : []),
+    ]]);
     const height = both("height_m");
     if (flight.altitude !== null) {
       height.push({ ...line([flight.altitude, flight.altitude], "commanded", COLOURS.commanded), x: [Math.max(0, time[0]), time[time.length - 1]] });
     }
     list.push(["height [m]", height]);
-    list.push(["attitude [°]: roll, and pitch dotted", [
+    if (!flight.commands.roll_deg) list.push(["attitude [°]: roll, and pitch dotted", [
       line(numbers(flight.flown.roll_deg), "roll", COLOURS.flown),
       line(numbers(flight.flown.pitch_deg), "pitch", COLOURS.flown, { dash: "dot" }),
       ...(flight.estimated ? [

@@ -12,9 +12,15 @@ import math
 import numpy as np
 
 from airl_mav.control.demand import AttitudeDemand, RateDemand
-from airl_mav.core.frames import Geodetic, geodetic_to_local, heading_to_ned, quat_yaw
+from airl_mav.core.frames import (
+    Geodetic,
+    geodetic_to_local,
+    heading_to_ned,
+    quat_to_euler,
+    quat_yaw,
+)
 from airl_mav.vehicle.rotation import rotate
-from firmware_sim.autopilot.autopilot_state import Message, Setpoint, Severity, Vector
+from firmware_sim.autopilot.autopilot_state import Message, Setpoint, Severity, Vector, Wire
 from firmware_sim.autopilot.events import command_events as events
 from firmware_sim.mavlink.codec import WireMessage, dialect
 from firmware_sim.mavlink.services.context import Context
@@ -81,6 +87,7 @@ def handle_attitude(message: WireMessage, context: Context) -> bool:
     mask: int = message.type_mask
     thrust = _thrust(message)
     demand: AttitudeDemand | RateDemand
+    wire: Wire
     if not mask & dialect.ATTITUDE_TARGET_TYPEMASK_ATTITUDE_IGNORE:
         q = np.array(message.q, np.float64)
         norm = float(np.linalg.norm(q))
@@ -90,6 +97,7 @@ def handle_attitude(message: WireMessage, context: Context) -> bool:
         ignored = mask & dialect.ATTITUDE_TARGET_TYPEMASK_BODY_YAW_RATE_IGNORE
         yaw_rate = 0.0 if ignored else _or_zero(message.body_yaw_rate)
         demand = AttitudeDemand((w, x, y, z), yaw_rate, thrust)
+        wire = (*quat_to_euler(q / norm), thrust)
     elif not mask & (
         dialect.ATTITUDE_TARGET_TYPEMASK_BODY_ROLL_RATE_IGNORE
         | dialect.ATTITUDE_TARGET_TYPEMASK_BODY_PITCH_RATE_IGNORE
@@ -98,9 +106,10 @@ def handle_attitude(message: WireMessage, context: Context) -> bool:
         yaw_rate = math.nan if ignored else _finite(message.body_yaw_rate)
         rates = _or_zero(message.body_roll_rate), _or_zero(message.body_pitch_rate), yaw_rate
         demand = RateDemand(rates, thrust)
+        wire = (*rates, thrust)
     else:
         return False  # PX4 says nothing
-    context.port.offer_attitude(demand, context.now_us)
+    context.port.offer_attitude(demand, context.now_us, wire)
     context.refusals.clear()
     return True
 
