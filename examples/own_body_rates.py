@@ -56,7 +56,7 @@ if __name__ == "__main__":
 
     for late_ms in (10, 100, 200):
         asked = Scenario(
-            policy=f"{__file__}:ToGoal", arena="no-obstacles", level="lockstep", episodes=3,
+            policy=f"{__file__}:ToGoal", arena="no-obstacles", level="lockstep", episodes=2,
             latency=f"{late_ms}ms",
         )  # fmt: skip
         run = rehearse(asked)

@@ -101,7 +101,7 @@ class Decisions:
         asked = checked_actions(action_spec, actions, lead)
         chosen = commands(action_spec, asked if lead else asked[None])
         charged = spec.costs != _FREE
-        level = chosen[:, :3]
+        level = chosen if self.navigation.by_rates else chosen[:, :3]
         last = self.navigation.whole_truth().fleet.setpoint[:, (0, 1, 3)] if charged else level
         self.navigation.fly(chosen)
         now = self._before = self.navigation.flights()

@@ -23,6 +23,7 @@ from airl_mav.envs.fleet import Verdict
 from airl_mav.envs.navigation import Flights
 from airl_mav.envs.spec import Costs
 from airl_mav.policy.action_sets import PAPER_SPEED_M_S
+from airl_mav.policy.actions import BodyRates
 
 PROGRESS_1_M = 0.02
 """`shaped`: per metre of progress towards the goal; 50 m of it are worth as much as the goal."""
@@ -35,6 +36,12 @@ TIME_COST_1_S = 0.015
 
 FAILURE_COST = 3.0
 """`timed`: cost of a collision or an empty battery; the goal is worth 1."""
+
+AGILE_BONUS = 4.0
+"""`progress`: of the goal, and what a failure costs."""
+
+AGILE_1_M, AGILE_1_S, AGILE_TURN = 0.3, 0.1, 0.002
+"""`progress`: per metre of progress, per second, and per (rad/s)² that a decision commands."""
 
 PAPER_BONUS = 1000.0
 
@@ -50,7 +57,8 @@ class Step:
     now: Flights
     """At its end."""
     commands: NDArray[np.float64]
-    """(n, 3) forward and right [m/s] in the heading frame, yaw rate [rad/s]."""
+    """(n, 3) forward and right [m/s] in the heading frame, yaw rate [rad/s]; of actions that
+    command body rates (n, 4), as `policy.actions.BodyRates`."""
     hold_s: float
     """How long an action is held [s]."""
 
@@ -89,6 +97,24 @@ def timed(step: Step) -> NDArray[np.float64]:
     return ended + PROGRESS_1_M * step.progress_m - TIME_COST_1_S * passed_s
 
 
+def progress(step: Step) -> NDArray[np.float64]:
+    """Return 4 for the goal, -4 for a failure, much for progress, less for time and turning.
+
+    For policies that decide with every image, as those that command body rates: what a decision is
+    worth is seen in its progress (Song et al., Autonomous Drone Racing with Deep Reinforcement
+    Learning, IROS 2021, eq. 3). Of other actions the yaw rate is what turns.
+    """
+    passed_s = step.now.time_s - step.before.time_s
+    by_rates = step.commands.shape[1] == len(BodyRates._fields)
+    rates = step.commands[:, :3] if by_rates else step.commands[:, 2:]
+    turned = np.square(rates).sum(axis=1)
+    ended = AGILE_BONUS * _ended(step)
+    found: NDArray[np.float64] = (
+        ended + AGILE_1_M * step.progress_m - AGILE_1_S * passed_s - AGILE_TURN * turned
+    )
+    return found
+
+
 def paper(step: Step) -> NDArray[np.float64]:
     """Return r = 1000 a - 1000 b - D_g + g D_c (Krishnan et al. 2021, appendix B, eqs. 2, 3).
 
@@ -117,6 +143,7 @@ def _ended(step: Step) -> NDArray[np.float64]:
 SHIPPED: dict[str, Reward] = {
     "shaped": shaped,
     "timed": timed,
+    "progress": progress,
     "paper-scaled": paper_scaled,
     "paper": paper,
 }

@@ -39,7 +39,7 @@ from airl_mav.profiles.distortion import check_distortion
 from airl_mav.profiles.projection import CYLINDER_MOST_DEG, Projection, check_fov
 from airl_mav.profiles.vehicle import load_vehicle
 
-SHIPPED_REWARDS = ("shaped", "timed", "paper-scaled", "paper")
+SHIPPED_REWARDS = ("shaped", "timed", "progress", "paper-scaled", "paper")
 """See `envs.rewards`."""
 
 RewardName = Annotated[str, part_name(REWARDS, SHIPPED_REWARDS)]
@@ -287,7 +287,8 @@ class EnvironmentSpec(ProfileModel):
     frames: Frames = 1
     in_flight: tuple[Told, ...] = Field(
         default=(),
-        description="what else the network is told: command, latency, age, setpoint, tilt, rates",
+        description="what else the network is told: command, latency, age, setpoint, tilt, rates,"
+        " height",
     )
     goal_height: GoalHeight = False
     actions: ActionSetName = Field(
@@ -300,8 +301,8 @@ class EnvironmentSpec(ProfileModel):
     max_rate_deg_s: MaxRate = later_field(MAX_RATE_DEG_S)
     reward: RewardName = Field(
         default="shaped",
-        description="reward: shaped, timed, paper-scaled, paper, or your own as MODULE:NAME or"
-        " FILE.py:NAME",
+        description="reward: shaped, timed, progress, paper-scaled, paper, or your own as"
+        " MODULE:NAME or FILE.py:NAME",
     )
     costs: Costs = Field(
         default_factory=Costs,

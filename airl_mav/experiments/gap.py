@@ -192,6 +192,9 @@ def _ways_of_compensation(
     """Return the roles in which the policy is flown compensated on the target, and remarks."""
     if scenario.compensate is not None:
         return (), ()
+    if policy.commands != "velocity":
+        told = f"{policy.name} commands {policy.commands.replace('_', ' ')}: not compensated."
+        return (), (told,)
     if load_vehicle(scenario.vehicle).response is None:
         return (), (f"The response of vehicle {scenario.vehicle} is not known: not compensated.",)
     if not load_vehicle(scenario.vehicle).compensable:

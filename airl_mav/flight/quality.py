@@ -19,6 +19,7 @@ from airl_mav.flight.smoothness import (
 )
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.deadlines import ages_at_effect, deadline_miss_ratio
+from airl_mav.latency.stamps import SETPOINT
 
 
 @dataclass(frozen=True)
@@ -143,7 +144,7 @@ def _conduct(
     flown = jerk_of(flown_velocity(trajectory, times_us))
     steps = command_steps(decisions)
     commanded = None
-    if "sent_us" in decisions:
+    if SETPOINT in decisions:
         commanded = jerk_of(commanded_velocity(trajectory, decisions, times_us))
     misses = None
     if hold_s > 0.0:

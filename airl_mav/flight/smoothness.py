@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import heading_to_ned, quats_to_euler
 from airl_mav.flight.trajectory import SAMPLE_US, Trajectory
-from airl_mav.latency.stamps import NO_STAMP
+from airl_mav.latency.stamps import NO_STAMP, SETPOINT
 
 SAMPLE_S = SAMPLE_US / US_PER_S
 
@@ -119,7 +119,7 @@ def _sent(
     decisions: Mapping[str, NDArray[Any]],
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return times (k,) [µs] and velocities (k, 3) [m/s] of the commands that were sent."""
-    if "sent_us" not in decisions or "setpoint" not in decisions:
+    if "sent_us" not in decisions or SETPOINT not in decisions:
         return np.zeros(0, np.int64), np.zeros((0, 3))
     sent = decisions["sent_us"] != NO_STAMP
-    return decisions["sent_us"][sent], decisions["setpoint"][sent, :3].astype(np.float64)
+    return decisions["sent_us"][sent], decisions[SETPOINT][sent, :3].astype(np.float64)

@@ -58,7 +58,7 @@ DISTANCE_SCALE_M = 20.0
 """`body`: the distance to the goal is divided by this."""
 
 HEIGHT_SCALE_M = 5.0
-"""How far the goal lies below the vehicle is divided by this."""
+"""How far the goal lies below the vehicle is divided by this, and how high that is."""
 
 STRIP_HALF_WIDTH = 1
 """`paper`: the bar that draws the bearing is three columns wide."""
@@ -114,7 +114,7 @@ def encode_layout(spec: ObservationSpec, seen: Observation, shrink: Shrink = NUM
         north, east [m] and distance [m].
         Where the network is told more, `in_flight` (n, k) float32: forward, right / 5 m/s and yaw
         rate [rad/s]; latency [s]; age [s]; the setpoint as `InFlight.setpoint` has it; down in
-        body axes FRD; body rates [rad/s].
+        body axes FRD; body rates [rad/s]; height above the start / 5 m.
         Of each further camera its image as in `body`, whichever layout it is: `grey_down`
         (n, frames, height, width) of a grey camera called down.
 
@@ -225,6 +225,10 @@ def _part(name: Told, seen: Observation) -> NDArray[np.float64]:
         if state is None or state.rates is None:
             raise ValueError("the network is told the body rates, and nobody measures them")
         return np.asarray(state.rates, np.float64)
+    if name == "height":
+        if state is None:
+            raise ValueError("the network is told its height, and nobody measures it")
+        return -np.asarray(state.position[..., 2:], np.float64) / HEIGHT_SCALE_M
     if known is None:
         raise ValueError(f"the network is told {name}, and nobody keeps account of it")
     if name == "command":

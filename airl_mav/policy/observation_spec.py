@@ -29,7 +29,7 @@ LayoutName = Annotated[str, plugins.part_name(plugins.LAYOUTS, SHIPPED)]
 Encoded = dict[str, NDArray[Any]]
 """Arrays of a layout, by key."""
 
-Told = Literal["command", "latency", "age", "setpoint", "tilt", "rates"]
+Told = Literal["command", "latency", "age", "setpoint", "tilt", "rates", "height"]
 
 TOLD: dict[Told, int] = {
     "command": 3,
@@ -38,6 +38,7 @@ TOLD: dict[Told, int] = {
     "setpoint": 4,
     "tilt": 3,
     "rates": 3,
+    "height": 1,
 }
 """Numbers of each thing that a network may be told of the decisions, and of the attitude."""
 
@@ -169,7 +170,8 @@ class ObservationSpec(ProfileModel):
         default=(),
         description="what else the network is told: command, the newest velocity setpoint; latency,"
         " the t2 that is expected; age, of the image; setpoint, the newest of any kind, all four"
-        " numbers of it; tilt, where down is in the body's axes; rates, the body's",
+        " numbers of it; tilt, where down is in the body's axes; rates, the body's; height, above"
+        " the start",
     )
     goal_height: GoalHeight = later_field(default=False)
     cameras: dict[CameraName, SeenCamera] = later_field(

@@ -25,7 +25,7 @@ from airl_mav.core.goals import Goal
 from airl_mav.core.plugins import names_code
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory, pose_at
-from airl_mav.latency.stamps import NO_STAMP
+from airl_mav.latency.stamps import NO_STAMP, SETPOINT, setpoint_column
 from airl_mav.policy.action_sets import commands, discrete_actions
 from airl_mav.policy.layouts import encode_layout
 from airl_mav.policy.learned import LearnedPolicy, load_learned
@@ -123,7 +123,8 @@ def seen_decisions(
         again: Its policy; None: no scores.
     """
     path, stamps = run.trajectories.get(record.index), run.latency.get(record.index, {})
-    needed = ("capture_us", "infer_start_us", "action_ready_us", "sent_us", "setpoint")
+    column = setpoint_column(stamps) or SETPOINT
+    needed = ("capture_us", "infer_start_us", "action_ready_us", "sent_us", column)
     if path is None or not len(path) or any(name not in stamps for name in needed):
         return
     lens = _Lens(arena, PolicyCamera.of(vehicle.camera), path, record.started_us)
@@ -145,7 +146,7 @@ def seen_decisions(
         image, state = lens.image(captured), _telemetry(stamps, path, began)
         views = {name: each.view(captured) for name, each in further.items()}
         seen = companion.observe(image, state, record.goal, began - captured, began, views)
-        setpoint = np.asarray(stamps["setpoint"][number], np.float64)
+        setpoint = np.asarray(stamps[column][number], np.float64)
         scores = same = None
         if again is not None and policy is not None:
             encoded = encode_layout(policy.card.observation, seen.rows(None))

@@ -13,7 +13,14 @@ from airl_mav.core.files import Arrays
 from airl_mav.core.frames import ned_to_heading, quat_multiply, quats_to_euler
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory
-from airl_mav.latency.stamps import ATTITUDE, NO_STAMP, RATES, SETPOINT, setpoint_column
+from airl_mav.latency.stamps import (
+    ATTITUDE,
+    NO_STAMP,
+    RATES,
+    SETPOINT,
+    commanded,
+    setpoint_column,
+)
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report.forensics.worst import flown_path
 
@@ -106,7 +113,7 @@ def track(run: LoadedRun, record: EpisodeRecord) -> TrackedFlight | None:
     stamps = run.latency.get(record.index, {})
     zero_us = record.started_us if record.navigation_us is None else record.navigation_us
     flown, heading = _motion(path.time_us, path.position, path.velocity, path.quaternion)
-    commands = commands_of(stamps, zero_us)
+    commands, pilot = commands_of(stamps, zero_us), run.info.config.get("pilot", {})
     if "heading_deg" in commands.values:
         flown = replace(flown, heading_deg=np.degrees(np.angle(np.exp(1j * heading))))
     elif "body_roll_rate_deg_s" in commands.values:
@@ -125,7 +132,8 @@ def track(run: LoadedRun, record: EpisodeRecord) -> TrackedFlight | None:
         estimated=estimated,
         errors=errors,
         commands=commands,
-        altitude_m=run.info.config.get("pilot", {}).get("altitude_m"),
+        # Who commands no velocity holds a height of its own.
+        altitude_m=pilot.get("altitude_m") if commanded(stamps) == "velocity" else None,
         power_w=path.power_w,
         motors=_motors(stamps, path.time_us),
     )

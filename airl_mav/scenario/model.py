@@ -54,9 +54,9 @@ def _seed(description: str, default: Any = 1) -> Any:
 DECISION_TIMEOUT_S = 2.0
 """A velocity persists so long by default when no other comes [s]."""
 
-UPRIGHT_S = 0.25
+UPRIGHT_S = 0.15
 """An attitude, or body rates, persist so long by default, beyond the hold time, before the flight
-controller is to hold the vehicle instead [s]: at 1 rad/s it has turned by 14 degrees."""
+controller is to hold the vehicle instead [s]: at 3 rad/s it has turned by 26 degrees."""
 
 
 class WatchdogSettings(ProfileModel):

@@ -218,4 +218,6 @@ def between_commands(pilot: PilotSettings, hover_s: float | None) -> str:
         words.append(f"{pilot.decisions} decisions")
     if pilot.compensate:
         words.append("latency compensated")
+    if pilot.commands != "velocity":
+        words.append(f"{pilot.commands.replace('_', ' ')} and thrust")
     return ", ".join(words)

@@ -395,7 +395,7 @@ class BuiltinAutopilot:
 
     def offer_setpoint(self, setpoint: Setpoint, time_us: int) -> None:
         """Hand over a valid offboard setpoint, received at `time_us` of simulated time."""
-        self._guidance.context.setpoint = setpoint
+        self._guidance.context.offer(setpoint)
         self.supervisor.setpoint(setpoint, time_us)
         if self.on_setpoint is not None:
             self.on_setpoint(setpoint.wire, time_us)
@@ -404,7 +404,7 @@ class BuiltinAutopilot:
         self, demand: AttitudeDemand | RateDemand, time_us: int, wire: Wire = UNTOLD
     ) -> None:
         """Hand over an offboard setpoint of attitude or body rates, received at `time_us`."""
-        self._guidance.context.setpoint = demand
+        self._guidance.context.offer(demand)
         self.supervisor.setpoint(None, time_us)
         if self.on_setpoint is not None:
             self.on_setpoint(wire, time_us)

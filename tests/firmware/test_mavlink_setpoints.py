@@ -164,6 +164,11 @@ def test_attitudes_and_body_rates(rig: Rig) -> None:
     assert isinstance(open_yaw, RateDemand)
     assert math.isnan(open_yaw.rates[2])
     assert open_yaw.thrust == 0.0
+    # What latency analysis recognises them by: angles or rates, and the thrust.
+    roll = 2.0 * math.atan2(0.8, 0.6)
+    assert rig.autopilot.wires[0] == pytest.approx((0.0, 0.0, 0.0, 0.5))
+    assert rig.autopilot.wires[1] == pytest.approx((roll, 0.0, 0.0, 1.0), abs=1e-6)
+    assert rig.autopilot.wires[2] == pytest.approx((0.1, -0.2, 0.3, 0.4))
 
 
 def test_an_attitude_that_commands_nothing_is_no_setpoint(rig: Rig) -> None:

@@ -71,6 +71,13 @@ def test_own_policy(tmp_path: Path) -> None:
     assert len(re.findall(r"^seed \d: (success|collision|timeout), ", text, re.M)) == 2
 
 
+def test_own_body_rates(tmp_path: Path) -> None:
+    """They need decisions in time, where velocities would hardly lose anything."""
+    text = output_of("own_body_rates.py", tmp_path)
+    assert "decisions 10 ms late: success, success\n" in text
+    assert "decisions 200 ms late: collision, collision\n" in text
+
+
 def test_own_arena(tmp_path: Path) -> None:
     text = output_of("own_arena.py", tmp_path)
     (trunks,) = numbers_after(r"seed 7: (\d+) trunks", text)

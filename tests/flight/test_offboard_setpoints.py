@@ -21,7 +21,7 @@ def attitude(rig: Rig, demand: AttitudeDemand | RateDemand, seconds: float) -> N
     """Command an attitude or rates at 20 Hz, once its kind is followed: before that the same thrust
     without tilt or turn."""
     rig.stream(None)
-    level = RateDemand((0.0, 0.0, 0.0), demand.thrust)
+    level: AttitudeDemand | RateDemand = RateDemand((0.0, 0.0, 0.0), demand.thrust)
     if isinstance(demand, AttitudeDemand):
         level = AttitudeDemand((1.0, 0.0, 0.0, 0.0), 0.0, demand.thrust)
     for wanted, time_s in ((level, KIND_US / US_PER_S), (demand, seconds)):

@@ -25,6 +25,7 @@ from airl_mav.cli.options import check_installed, read_options
 from airl_mav.cli.sitl import SitlOptions
 from airl_mav.cli.viewing import view_of
 from airl_mav.core.clock import SimClock
+from airl_mav.core.constants import CommandKind
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.latency.samplers import FixedSampler
 from airl_mav.profiles.arena import ArenaSpec
@@ -268,6 +269,28 @@ def test_numbers_and_texts_are_told_and_escaped() -> None:
     for part in ("offboard", "2.0 s, 4.0 m to the goal", "+2.0 forward", "150 ms", "90 %"):
         assert part in told
     assert "1.5 s &lt;b&gt;low" in texts_html(shown)
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        ("velocity", ("+0.1 forward, -0.2 right,", "+0.3 down [m/s], +29 °/s")),
+        ("attitude", ("roll +6, pitch -11,", "yaw +17 °, thrust 0.50")),
+        ("body_rates", ("roll +6, pitch -11,", "yaw +17 °/s, thrust 0.50")),
+    ],
+)
+def test_the_panel_says_what_is_commanded(kind: CommandKind, words: tuple[str, str]) -> None:
+    """And the scene has an arrow of a velocity alone."""
+    shown = Shown()
+    shown.take(episode(), None)
+    shown.take(vehicle(2.0), None)
+    known = decided(2.0, t2_ms=1.0).model_copy(
+        update={"setpoint": (0.1, -0.2, 0.3, 0.5), "commands": kind}
+    )
+    shown.take(known, DEPTH_MM)
+    panel = numbers_html(shown)
+    assert all(word in panel for word in words)
+    assert (shown.command is None) == (kind != "velocity")
 
 
 # --- pace and latency

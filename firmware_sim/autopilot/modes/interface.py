@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 from airl_mav.control.demand import AnyDemand, AttitudeDemand, Demand, RateDemand
 from airl_mav.core.constants import US_PER_S
@@ -22,6 +22,9 @@ from firmware_sim.autopilot.travel import Travel
 NAN = math.nan
 FREE: Vec = (NAN, NAN, NAN)
 """Of a demand's position or velocity: no axis is commanded."""
+
+
+OffboardSetpoint: TypeAlias = "Setpoint | AttitudeDemand | RateDemand"
 
 
 @dataclass
@@ -46,8 +49,10 @@ class FlightContext:
     """Altitude of home above mean sea level [m]."""
     travel: Travel = field(init=False)
     """How the automatic modes move."""
-    setpoint: Setpoint | AttitudeDemand | RateDemand | None = None
+    setpoint: OffboardSetpoint | None = None
     """The newest offboard setpoint."""
+    setpoints: dict[type, OffboardSetpoint] = field(default_factory=dict)
+    """The newest of each kind."""
     return_place: Callable[[], Place | None] | None = None
     """Chooses where Return goes; returns None where it flies items of the mission. None = home."""
     triplet: Triplet = STANDING
@@ -73,6 +78,10 @@ class FlightContext:
 
     def __post_init__(self) -> None:
         self.travel = Travel(self.value)
+
+    def offer(self, setpoint: OffboardSetpoint) -> None:
+        """Take an offboard setpoint."""
+        self.setpoint = self.setpoints[type(setpoint)] = setpoint
 
     def height(self, state: Vector) -> float:
         """Return the height above home [m]."""

@@ -17,7 +17,14 @@ from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.autopilot_state import Setpoint
 from firmware_sim.autopilot.error_state import RATES
 from firmware_sim.autopilot.modes.hold import Hold
-from firmware_sim.autopilot.modes.interface import FREE, NAN, FlightContext, FlightMode, triple
+from firmware_sim.autopilot.modes.interface import (
+    FREE,
+    NAN,
+    FlightContext,
+    FlightMode,
+    OffboardSetpoint,
+    triple,
+)
 from firmware_sim.autopilot.requests import Request
 
 CLIMBS_M_S = 0.1
@@ -36,17 +43,17 @@ class Offboard(FlightMode):
     def __init__(self, context: FlightContext, /) -> None:
         self._context = context
         self._waiting = Hold(context)
-        self._setpoint: Setpoint | AttitudeDemand | RateDemand | None = None
+        self._setpoint: OffboardSetpoint | None = None
         self._flown: AnyDemand | None = None
-        self._followed: AnyDemand | None = None
-        """The newest of the kind that is followed now."""
+        self._kind: type = Setpoint
+        """Which kind of setpoint is followed."""
         self._kind_us = 0
         """When the kind is looked at next [µs]."""
 
     @property
     def lifts(self) -> bool:
         """Whether the setpoint lies above the ground or goes up, or commands a thrust."""
-        demand = self._newest()
+        demand = self._demand_of(self._context.setpoint)
         if demand is None:
             return False
         if isinstance(demand, AttitudeDemand | RateDemand):
@@ -63,33 +70,26 @@ class Offboard(FlightMode):
 
     def demand(self, state: Vector, time_us: int, /) -> AnyDemand:
         """Return what the companion commands."""
-        demand = self._newest()
+        newest = self._context.setpoint
+        if newest is not None and time_us >= self._kind_us:
+            self._kind_us, self._kind = time_us + KIND_US, type(newest)
+        demand = self._demand_of(self._context.setpoints.get(self._kind))
         if demand is None:
             return self._waiting.demand(state, time_us)
-        if time_us >= self._kind_us:
-            self._kind_us, self._followed = time_us + KIND_US, demand
-        elif _kind(demand) is _kind(self._followed):
-            self._followed = demand
-        elif self._followed is not None:
-            demand = self._followed
         if isinstance(demand, RateDemand) and math.isnan(demand.rates[2]):
             # No yaw rate is commanded: it stays what it is.
             roll, pitch, _ = demand.rates
             return RateDemand((roll, pitch, state.item(RATES + 2)), demand.thrust)
         return demand
 
-    def _newest(self) -> AnyDemand | None:
-        """Return the newest setpoint as a demand, made once."""
-        setpoint = self._context.setpoint
-        if setpoint is not None and setpoint is not self._setpoint:
+    def _demand_of(self, setpoint: OffboardSetpoint | None) -> AnyDemand | None:
+        """Return a setpoint as a demand, made once as long as it stays the same."""
+        if setpoint is None:
+            return None
+        if setpoint is not self._setpoint:
             self._setpoint = setpoint
             self._flown = demand_of(setpoint) if isinstance(setpoint, Setpoint) else setpoint
         return self._flown
-
-
-def _kind(demand: AnyDemand | None) -> type[AnyDemand]:
-    """Return what kind of setpoint a demand is of: positions and velocities are one."""
-    return type(demand) if isinstance(demand, AttitudeDemand | RateDemand) else Demand
 
 
 def demand_of(setpoint: Setpoint) -> Demand | TrajectoryDemand:
