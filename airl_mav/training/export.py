@@ -20,7 +20,12 @@ from torch import nn
 
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.plugins import MODELS, load_part
-from airl_mav.policy.action_sets import ActionSpec, continuous_numbers, discrete_actions
+from airl_mav.policy.action_sets import (
+    BODY_RATES,
+    ActionSpec,
+    continuous_numbers,
+    discrete_actions,
+)
 from airl_mav.policy.card import PolicyCard, PolicyFacts
 from airl_mav.policy.layouts import GOAL, IN_FLIGHT, VELOCITY, boxes
 from airl_mav.policy.observation_spec import ObservationSpec
@@ -301,7 +306,7 @@ def taken_by(model: BaseAlgorithm) -> Taken:
     shape = None if kind is None else images[kind].shape
     actions: str | None = None
     if isinstance(space, spaces.Box):
-        actions = "velocity3d" if space.shape == (3,) else "velocity"
+        actions = {3: "velocity3d", 4: BODY_RATES}.get(len(space.low), "velocity")
     goal = images.get(GOAL)
     tells_height = goal is not None and goal.shape == (4,)
     if kind is None or shape is None or len(shape) != 3:

@@ -16,7 +16,7 @@ from airl_mav.core.provenance import package_versions
 from airl_mav.envs.sight import further_seen
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.flight.judge import GOAL_RADIUS_M
-from airl_mav.policy.action_sets import PAPER_SPEED_M_S, ActionSetName, ActionSpec
+from airl_mav.policy.action_sets import MAX_RATE_DEG_S, PAPER_SPEED_M_S, ActionSetName, ActionSpec
 from airl_mav.policy.actions import DecisionTiming
 from airl_mav.policy.card import PolicyFacts, Training
 from airl_mav.policy.observation_spec import LayoutName, ObservationSpec
@@ -50,6 +50,7 @@ DEFAULTS: dict[str, Any] = {
     "cameras": {},
     "actions": "arc-25",
     "max_speed_m_s": PAPER_SPEED_M_S,
+    "max_rate_deg_s": MAX_RATE_DEG_S,
     "hold_s": PilotSettings.hold_s,
     "goal_radius_m": GOAL_RADIUS_M,
     "altitude_m": PilotSettings.altitude_m,
@@ -138,12 +139,16 @@ class ExportRequest(BaseModel):
     actions: ActionSetName | None = Field(
         default=None,
         description="action set that the model was trained with: arc-25, paper-25, velocity,"
-        " velocity-fixed-yaw, arc3d-75, velocity3d, velocity3d-fixed-yaw, or your own as"
-        " MODULE:NAME or FILE.py:NAME; by default arc-25, or velocity where a .zip has continuous"
-        " actions, velocity3d where they are three",
+        " velocity-fixed-yaw, arc3d-75, velocity3d, velocity3d-fixed-yaw, body-rates, or your own"
+        " as MODULE:NAME or FILE.py:NAME; by default arc-25, or velocity where a .zip has"
+        " continuous actions, velocity3d where they are three, body-rates where they are four",
     )
     max_speed_m_s: float | None = Field(
         default=None, description=f"fastest action, m/s; by default {PAPER_SPEED_M_S:g}"
+    )
+    max_rate_deg_s: float | None = Field(
+        default=None,
+        description=f"greatest body rate of body-rates, deg/s; by default {MAX_RATE_DEG_S:g}",
     )
     hold_s: float | None = Field(
         default=None,
@@ -217,14 +222,14 @@ class ExportRequest(BaseModel):
             raise FieldError("image", image, "WIDTHxHEIGHT in px, as 32x24")
         seen = {name: known[name] for name in SEEN}
         seen |= {"width_px": int(size[1]), "height_px": int(size[2])}
-        speed = {"set": known["actions"], "max_speed_m_s": known["max_speed_m_s"]}
+        limits = {name: known[name] for name in ("max_speed_m_s", "max_rate_deg_s")}
         facts = {name: known[name] for name in (*FLOWN, "decisions", "compensate")} | {
             "name": self.policy_name,
             "description": self.description,
             "algorithm": self.algorithm or "",
             "epsilon": self.epsilon,
             "observation": _observation(image, seen),
-            "actions": validated(ActionSpec, speed),
+            "actions": validated(ActionSpec, {"set": known["actions"], **limits}),
             "training": Training(
                 arena=None if environment is None else environment.arena,
                 command=command,
@@ -270,6 +275,7 @@ def _known_of(spec: EnvironmentSpec) -> dict[str, Any]:
         "cameras": further_seen(spec, vehicle),
         "actions": spec.actions,
         "max_speed_m_s": spec.max_speed_m_s,
+        "max_rate_deg_s": spec.max_rate_deg_s,
         **{name: getattr(spec.episode, name) for name in FLOWN},
         "decisions": spec.decisions,
         "compensate": spec.compensate,
