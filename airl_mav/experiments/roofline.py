@@ -136,6 +136,10 @@ def find_roofline(request: RooflineRequest) -> Roofline:
     if len(set(request.computers)) < len(request.computers) or not request.computers:
         raise FieldError("computers", " ".join(request.computers), "one or more, each once")
     policy = find_policy(request.policy)
+    if policy.commands != "velocity":
+        raise FieldError(
+            "policy", request.policy, "one that commands velocities, whose fastest is looked for"
+        )
     bare = _with_frame_rate(load_vehicle(request.vehicle), request.frame_rate_hz)
     noticed = () if request.sensing_distance_m is not None else _noticed(policy, bare, request)
     distance_m = request.sensing_distance_m or min(noticed)

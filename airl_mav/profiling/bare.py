@@ -126,7 +126,7 @@ def random_observations(
     return [
         (
             frame(k),
-            Kinematics(rng.normal(0.0, 5.0, 3), rng.normal(0.0, 2.0, 3), level),
+            Kinematics(rng.normal(0.0, 5.0, 3), rng.normal(0.0, 2.0, 3), level, np.zeros(3)),
         )
         for k in range(OBSERVATIONS)
     ]

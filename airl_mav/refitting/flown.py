@@ -12,6 +12,7 @@ from airl_mav.black_box.reading import BlackBox
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.flight.trajectory import Trajectory
+from airl_mav.latency.stamps import SETPOINT, commanded
 from airl_mav.report.recorded_flight import NAVIGATING, path_of, stamps_of
 from airl_mav.vehicle_log.alignment import Alignment, align
 from airl_mav.vehicle_log.ulog import MOTORS, VehicleLog
@@ -78,8 +79,14 @@ def flown_of(box: BlackBox, log: VehicleLog | None) -> Flown:
     begun = [each.time_us for each in box.all_of(Phase) if each.phase == NAVIGATING]
     if not begun or not decisions or len(path) < 2:
         raise UsageError(f"{box.path}: no decision was recorded; accepted: a flight that navigated")
-    stamps = stamps_of(decisions)
-    sent_us, setpoints = stamps["sent_us"], np.asarray(stamps["setpoint"], np.float64)
+    stamps = stamps_of(box)
+    if SETPOINT not in stamps:
+        kind = commanded(stamps).replace("_", " ")
+        raise UsageError(
+            f"{box.path}: its policy commanded {kind}; accepted: a flight by velocities, whose"
+            " response is fitted"
+        )
+    sent_us, setpoints = stamps["sent_us"], np.asarray(stamps[SETPOINT], np.float64)
     after = [
         each.time_us
         for each in box.all_of(Phase)

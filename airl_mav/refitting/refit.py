@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from airl_mav.black_box.messages import Decision
 from airl_mav.black_box.reading import BlackBox, read_black_box
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.errors import FieldError, UsageError
@@ -168,7 +167,7 @@ def refit(
         air=air,
         latencies=no_latencies()
         if box is None
-        else fit_latencies(stamps_of(box.all_of(Decision)), flown.clocks, streams[3]),
+        else fit_latencies(stamps_of(box), flown.clocks, streams[3]),
         notes=(*remarks, *_notes(flown, box, board)),
         parameters=parameters,
     )

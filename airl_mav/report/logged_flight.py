@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.black_box.messages import Decision
 from airl_mav.black_box.reading import BlackBox
 from airl_mav.core.constants import US_PER_MS
 from airl_mav.flight.trajectory import Trajectory
+from airl_mav.latency.stamps import SETPOINT
 from airl_mav.rehearsal.run_folder import FlownEpisode
 from airl_mav.report.recorded_flight import episode_of, path_of, stamps_of
 from airl_mav.report.tracking import MOTOR_OUTPUTS, MOTOR_TIMES
@@ -30,9 +30,10 @@ def logged_episode_of(box: BlackBox, log: VehicleLog) -> FlownEpisode:
         UsageError: The black box does not hold its settings, or the log is of another flight.
     """
     told = path_of(box)
-    stamps = stamps_of(box.all_of(Decision))
-    setpoints = np.asarray(stamps["setpoint"], np.float64)
-    clocks = align(told, log, stamps["sent_us"], setpoints)
+    stamps = stamps_of(box)
+    setpoints = np.asarray(stamps.get(SETPOINT, np.zeros((0, 4))), np.float64)
+    # Setpoints of no other kind are looked for in the log.
+    clocks = align(told, log, stamps["sent_us"][: len(setpoints)], setpoints)
     ahead_us = offset_us(clocks)
     path = _path(told, log, clocks.told_us, ahead_us)
     note = (

@@ -11,7 +11,7 @@ from pydantic import Field, TypeAdapter
 
 from airl_mav.black_box.messages import Decision, End, Phase, Resources, Status, Telemetry
 from airl_mav.black_box.reading import BlackBox
-from airl_mav.core.constants import US_PER_S
+from airl_mav.core.constants import US_PER_S, CommandKind
 from airl_mav.core.files import typed
 from airl_mav.core.goals import Goal, goal_distance_m
 from airl_mav.core.process_use import ProcessUse
@@ -19,7 +19,7 @@ from airl_mav.flight.judge import Outcome
 from airl_mav.flight.quality import measure_quality
 from airl_mav.flight.record import NO_ARENA, EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory
-from airl_mav.latency.stamps import NO_STAMP, STAMPS
+from airl_mav.latency.stamps import NO_STAMP, SETPOINTS, STAMPS
 from airl_mav.rehearsal.run_folder import FlownEpisode, RunInfo, run_info
 from companion.limits import OUT_OF_TIME
 
@@ -39,6 +39,7 @@ class FlownPilot:
 
     hold_s: float
     goal_radius_m: float
+    commands: CommandKind = "velocity"
 
 
 @dataclass(frozen=True)
@@ -89,7 +90,7 @@ def episode_of(
     """
     asked = settings_of(box)
     path = path_of(box) if path is None else path
-    stamps = stamps_of(box.all_of(Decision))
+    stamps = stamps_of(box)
     started_us = int(path.time_us[0]) if len(path) else 0
     phases = box.all_of(Phase)
     begun = [phase.time_us for phase in phases if phase.phase == NAVIGATING]
@@ -152,15 +153,20 @@ def path_of(box: BlackBox) -> Trajectory:
     return Trajectory(times, states[:, :3], states[:, 3:6], states[:, 6:], power_w)
 
 
-def stamps_of(decisions: list[Decision]) -> dict[str, NDArray[Any]]:
-    """Return the stamps of decisions by column, as `latency.stamps.DecisionLog.columns`."""
+def stamps_of(box: BlackBox) -> dict[str, NDArray[Any]]:
+    """Return the stamps of the decisions by column, as `latency.stamps.DecisionLog.columns`.
+
+    Raises:
+        UsageError: The black box does not hold its settings.
+    """
+    decisions, commands = box.all_of(Decision), settings_of(box).pilot.commands
     columns: dict[str, NDArray[Any]] = {
         name: np.array([getattr(each, name) for each in decisions], np.int64) for name in STAMPS
     }
     # Of all but the last it is known when the hold ended, not only when it was to end.
     columns["held_until_us"][:-1] = [each.held_before_us for each in decisions[1:]]
     rows = [each.setpoint for each in decisions]
-    columns["setpoint"] = np.array(rows, np.float32).reshape(len(rows), 4)
+    columns[SETPOINTS[commands]] = np.array(rows, np.float32).reshape(len(rows), 4)
     return columns
 
 
