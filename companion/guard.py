@@ -21,6 +21,10 @@ STDERR = 2
 STARVED_S = 5.0
 """The process ends when the thread has not run for this long [wall s]."""
 
+TURNING_STARVED_S = 1.0
+"""The same while an attitude or body rates are commanded: MAVSDK repeats them meanwhile, and the
+flight controller's failsafe can act only when it no longer does [wall s]."""
+
 
 class Guard(Protocol):
     """Calls a watchdog's `look` in time."""
@@ -59,7 +63,8 @@ class ThreadGuard:
     def _run(self, watchdog: Watchdog) -> None:
         try:
             while not self._done.is_set():
-                faulthandler.dump_traceback_later(STARVED_S, exit=True, file=STDERR)
+                starved_s = STARVED_S if watchdog.by_velocity else TURNING_STARVED_S
+                faulthandler.dump_traceback_later(starved_s, exit=True, file=STDERR)
                 for _ in range(CHECKS_PER_RESTART):
                     if self._done.is_set():
                         return

@@ -19,7 +19,7 @@ from airl_mav.core.clock import Clock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.policy.actions import Attitude, BodyRates
 from airl_mav.scenario.model import WatchdogSettings
-from companion.interfaces import STOP, Link, LinkError, Setpoint
+from companion.interfaces import STOP, BodyVelocity, Link, LinkError, Setpoint
 
 
 class Watchdog:
@@ -70,6 +70,11 @@ class Watchdog:
             if hover_s is not None:
                 self._hover_us = self._fed_us + hold_us + int(hover_s * US_PER_S)
             return True
+
+    @property
+    def by_velocity(self) -> bool:
+        """Whether the newest setpoint is a velocity, which is safe for seconds."""
+        return self._stopped or isinstance(self._last, BodyVelocity)
 
     @property
     def hover_after_s(self) -> float | None:

@@ -101,8 +101,12 @@ class Decisions:
         asked = checked_actions(action_spec, actions, lead)
         chosen = commands(action_spec, asked if lead else asked[None])
         charged = spec.costs != _FREE
-        level = chosen if self.navigation.by_rates else chosen[:, :3]
-        last = self.navigation.whole_truth().fleet.setpoint[:, (0, 1, 3)] if charged else level
+        by_rates = self.navigation.by_rates
+        level = chosen if by_rates else chosen[:, :3]
+        last = level
+        if charged:
+            flown = self.navigation.whole_truth().fleet.setpoint
+            last = flown.copy() if by_rates else flown[:, (0, 1, 3)]
         self.navigation.fly(chosen)
         now = self._before = self.navigation.flights()
         truncated: NDArray[np.bool_] = now.verdict == Verdict.TIMEOUT

@@ -78,9 +78,15 @@ def _page(card: PolicyCard) -> Iterator[str]:
         f"| sees | {image} of {seen.width_px}x{seen.height_px} px, {seen.horizontal_fov_deg:g} "
         f"deg wide{far}{others}; own velocity; goal{high} (layout `{seen.layout}`) |"
     )
-    yield f"| decides | `{actions.set}`, up to {actions.max_speed_m_s:.3g} m/s |"
-    yield f"| holds each action | {card.hold_s:g} s |"
-    flies = "begins" if commands_vertical_speed(actions) else "flies"
+    if actions.commands == "velocity":
+        yield f"| decides | `{actions.set}`, up to {actions.max_speed_m_s:.3g} m/s |"
+    else:
+        yield f"| is told | {', '.join(seen.in_flight)} |"
+        yield f"| decides | `{actions.set}`, up to {actions.max_rate_deg_s:g} deg/s, and a thrust |"
+    if actions.commands == "velocity" or card.decisions == "sequential":
+        yield f"| holds each action | {card.hold_s:g} s |"
+    holds_altitude = actions.commands == "velocity" and not commands_vertical_speed(actions)
+    flies = "flies" if holds_altitude else "begins"
     yield f"| {flies} at | {card.altitude_m:g} m, to within {card.goal_radius_m:g} m of the goal |"
     yield f"| network | {' '.join(card.network.split())} |"
     yield f"| size | {card.parameters:,} parameters, {card.macs:,} multiply-accumulates |"

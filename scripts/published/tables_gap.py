@@ -382,6 +382,28 @@ _LATENCIES = (
 )
 
 
+_BY_RATES = {
+    "reference": "`body-rates`, 1 ms",
+    "target": "`body-rates`, 120 ms",
+    "mitigated": "`body-rates-120ms`, 120 ms",
+    "mitigated-reference": "`body-rates-120ms`, 1 ms",
+}
+
+
+@block("body-rates", "body-rates-gap", "body-rates-lockstep")
+def body_rates(records: Records) -> str:
+    rows = []
+    for role, title in _BY_RATES.items():
+        cells: list[str] = []
+        for record in ("body-rates-gap", "body-rates-lockstep"):
+            run = records[record].runs[f"no-obstacles-{role}"]
+            figures = f"{number(run.flight_time_s, 2)} s", f"{number(run.distance_m, 1)} m"
+            cells += [f"{rate(run)} %", *figures]
+        rows.append((title, *cells))
+    heads = ("success, gym", "time", "distance", "success, lockstep", "time", "distance")
+    return table(("policy, t2", *heads), rows, 6)
+
+
 @block("degradation", "degradation")
 def degradation(records: Records) -> str:
     record, paper = records["degradation"], load_published().degradation

@@ -30,6 +30,8 @@ SHIPPED: dict[str, tuple[str, str]] = {
     "crowded-fast": ("crowded-fast", "run"),
     "crowded-panorama": ("crowded-panorama", "run"),
     "gates": ("gates", "run"),
+    "body-rates": ("body-rates-gap", "no-obstacles-reference"),
+    "body-rates-120ms": ("body-rates-gap", "no-obstacles-mitigated"),
 }
 """Where the flights of each policy stand: in its own arena, as late as in its training."""
 
@@ -41,6 +43,7 @@ _ACTIONS = {
     "arc-25": "arcs",
     "velocity": "continuous",
     "velocity3d-fixed-yaw": "continuous, with a climb",
+    "body-rates": "body rates and thrust",
 }
 
 

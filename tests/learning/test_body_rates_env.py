@@ -140,6 +140,22 @@ def test_commands_are_four_numbers() -> None:
         navigation.fly(np.zeros((2, 3)))
 
 
+def test_what_a_failure_costs_is_taken_off_any_reward() -> None:
+    """Straight into the floor: 4 of the reward, and 6 more."""
+    paid = []
+    for failure in (0.0, 6.0):
+        knobs = KNOBS | {"reward": "progress", "costs": {"failure": failure}}
+        env = gym.make("airl/Navigation-v0", **knobs)
+        env.reset(seed=1)
+        ended, reward = False, 0.0
+        while not ended:
+            _, reward, ended, truncated, _ = env.step(np.array([0.0, 0.0, 0.0, -1.0], np.float32))
+            assert not truncated
+        paid.append(float(reward))
+    assert paid[0] < -3.5
+    assert paid[0] - paid[1] == pytest.approx(6.0)
+
+
 def test_the_reward_of_progress_by_hand() -> None:
     navigation = begun(2)
     before = navigation.flights()

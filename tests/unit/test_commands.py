@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import CommandKind
 from airl_mav.core.errors import FieldError
 from airl_mav.core.frames import down_in_body
@@ -22,8 +23,10 @@ from airl_mav.policy.layouts import boxes, encode_layout
 from airl_mav.policy.observation import InFlight, Kinematics, observe
 from airl_mav.policy.observation_spec import ObservationSpec
 from airl_mav.policy.registry import PolicyInfo, find_policy
-from airl_mav.scenario.model import Scenario
+from airl_mav.scenario.model import Scenario, WatchdogSettings
 from airl_mav.scenario.piloting import check_commands, check_compensated, decide_piloting
+from companion.interfaces import STOP, BodyVelocity, Setpoint, VehicleStatus
+from companion.watchdog import Watchdog
 from firmware_sim.recording import SetpointLog
 from tests.support.processes import ROOT
 
@@ -221,3 +224,56 @@ def test_what_cannot_be_flown_by_body_rates_or_attitude_is_refused() -> None:
         vehicle: Any = None
         with pytest.raises(FieldError, match="whose effect is not foreseen"):
             check_compensated(pilot, policy, vehicle)
+
+
+# --- the watchdog
+
+
+class Noting:
+    """A link that notes what is sent."""
+
+    connected = True
+
+    def __init__(self) -> None:
+        self.sent: list[Setpoint] = []
+
+    def send_setpoint(self, setpoint: Setpoint) -> None:
+        self.sent.append(setpoint)
+
+    def kinematics(self) -> Kinematics:
+        raise NotImplementedError
+
+    def status(self) -> VehicleStatus:
+        return VehicleStatus(armed=True, offboard=True, mode="offboard")
+
+    def release(self) -> None:
+        raise NotImplementedError
+
+    def leave_offboard(self) -> None:
+        self.sent.clear()
+
+
+@pytest.mark.parametrize(
+    ("setpoint", "before"),
+    [
+        (HALF, [BodyRates(0.0, 0.0, 0.0, HALF.thrust)]),
+        (LEAN, [Attitude(0.0, 0.0, LEAN.yaw_rad, LEAN.thrust)]),
+        (BodyVelocity(1.0, 0.0, 0.0, 0.0), []),
+    ],
+)
+def test_an_overdue_turn_or_lean_is_ended_before_the_stop(
+    setpoint: Setpoint, before: list[Setpoint]
+) -> None:
+    """PX4 flies the stop, which is a velocity, up to half a second later."""
+    link, clock = Noting(), SimClock()
+    watchdog = Watchdog(link, clock, WatchdogSettings(decision_timeout_s=0.2))
+    assert watchdog.by_velocity
+    assert watchdog.command(setpoint, 0)
+    assert watchdog.by_velocity == (not before)
+    clock.advance(200_000)
+    watchdog.look()
+    assert link.sent == [setpoint, *before, STOP]
+    assert watchdog.by_velocity
+    clock.advance(100_000)
+    watchdog.look()
+    assert len(link.sent) == 2 + len(before), "once"
