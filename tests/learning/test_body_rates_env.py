@@ -147,11 +147,12 @@ def test_what_a_failure_costs_is_taken_off_any_reward() -> None:
         knobs = KNOBS | {"reward": "progress", "costs": {"failure": failure}}
         env = gym.make("airl/Navigation-v0", **knobs)
         env.reset(seed=1)
-        ended, reward = False, 0.0
+        ended, last = False, 0.0
         while not ended:
             _, reward, ended, truncated, _ = env.step(np.array([0.0, 0.0, 0.0, -1.0], np.float32))
+            last = float(reward)
             assert not truncated
-        paid.append(float(reward))
+        paid.append(last)
     assert paid[0] < -3.5
     assert paid[0] - paid[1] == pytest.approx(6.0)
 
