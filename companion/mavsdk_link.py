@@ -23,7 +23,7 @@ from mavsdk.plugins.server_utility import ServerUtility, StatusTextType
 from mavsdk.plugins.telemetry import FlightMode, Telemetry, TelemetryError, TelemetryResult
 
 from airl_mav.core.clock import Clock, WallClock
-from airl_mav.core.constants import US_PER_S
+from airl_mav.core.constants import UNMEASURED_A, US_PER_S
 from airl_mav.policy.actions import Attitude
 from airl_mav.policy.observation import Kinematics
 from companion.dialects import POSITION, PX4, Dialect, dialect_of
@@ -261,11 +261,11 @@ class MavsdkLink:
     def battery(self) -> BatteryState:
         """Return the newest state of the battery."""
         told = self._telemetry.battery()
-        percent = _known(told.remaining_percent)
+        percent, current_a = _known(told.remaining_percent), _known(told.current_battery_a)
         return BatteryState(
             # No battery that flies has 0 V: nothing was heard of it yet.
             _known(told.voltage_v) or None,
-            _known(told.current_battery_a),
+            None if current_a == UNMEASURED_A else current_a,
             None if percent is None else percent / 100.0,
         )
 

@@ -56,3 +56,6 @@ Level = Literal["gym", "lockstep", "sitl", "hil", "firmware", "flight"]
 """What flew, as a report calls it: a rung of the fidelity ladder."""
 CommandKind = Literal["velocity", "attitude", "body_rates"]
 """What a policy commands: all actions of one are of one kind."""
+UNMEASURED_A: Final = -1.0
+"""What PX4 tells as the battery's current where its monitor measures none [A]; its simulated one
+does not. Source: PX4 1.16, msg/versioned/BatteryStatus.msg, current_a."""

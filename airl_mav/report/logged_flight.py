@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from airl_mav.black_box.reading import BlackBox
 from airl_mav.core.constants import US_PER_MS
 from airl_mav.flight.trajectory import Trajectory
-from airl_mav.latency.stamps import SETPOINT
+from airl_mav.latency.stamps import SETPOINTS, commanded
 from airl_mav.rehearsal.run_folder import FlownEpisode
 from airl_mav.report.recorded_flight import episode_of, path_of, stamps_of
 from airl_mav.report.tracking import MOTOR_OUTPUTS, MOTOR_TIMES
@@ -31,9 +31,9 @@ def logged_episode_of(box: BlackBox, log: VehicleLog) -> FlownEpisode:
     """
     told = path_of(box)
     stamps = stamps_of(box)
-    setpoints = np.asarray(stamps.get(SETPOINT, np.zeros((0, 4))), np.float64)
-    # Setpoints of no other kind are looked for in the log.
-    clocks = align(told, log, stamps["sent_us"][: len(setpoints)], setpoints)
+    kind = commanded(stamps)
+    setpoints = np.asarray(stamps[SETPOINTS[kind]], np.float64)
+    clocks = align(told, log, stamps["sent_us"], setpoints, kind)
     ahead_us = offset_us(clocks)
     path = _path(told, log, clocks.told_us, ahead_us)
     note = (

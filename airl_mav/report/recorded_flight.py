@@ -11,7 +11,7 @@ from pydantic import Field, TypeAdapter
 
 from airl_mav.black_box.messages import Decision, End, Phase, Resources, Status, Telemetry
 from airl_mav.black_box.reading import BlackBox
-from airl_mav.core.constants import US_PER_S, CommandKind
+from airl_mav.core.constants import UNMEASURED_A, US_PER_S, CommandKind
 from airl_mav.core.files import typed
 from airl_mav.core.goals import Goal, goal_distance_m
 from airl_mav.core.process_use import ProcessUse
@@ -171,11 +171,16 @@ def stamps_of(box: BlackBox) -> dict[str, NDArray[Any]]:
 
 
 def _power_w(statuses: list[Status], times_us: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the power (n,) at times (n,): the newest that was told, the first one before it."""
+    """Return the power (n,) at times (n,): the newest that was told, the first one before it.
+
+    Older recordings hold PX4's -1 A where it measures no current.
+    """
     told = [
         (status.time_us, status.voltage_v * status.current_a)
         for status in statuses
-        if status.voltage_v is not None and status.current_a is not None
+        if status.voltage_v is not None
+        and status.current_a is not None
+        and status.current_a != UNMEASURED_A
     ]
     if not told:
         return np.zeros(len(times_us))

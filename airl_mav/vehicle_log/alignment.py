@@ -12,6 +12,7 @@ trip, from a setpoint that is sent to telemetry that could tell of it.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,8 +20,9 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from scipy.signal import correlate, correlation_lags
 
-from airl_mav.core.constants import US_PER_S
+from airl_mav.core.constants import US_PER_S, CommandKind
 from airl_mav.core.errors import UsageError
+from airl_mav.core.frames import quat_from_euler
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.vehicle_log.ulog import Series, VehicleLog
 
@@ -41,6 +43,10 @@ LEAST_SETPOINTS = 3
 
 SAME_SPEED_M_S, SAME_RATE_RAD_S = 0.02, 0.01
 """Setpoints are the same when their speed and yaw rate differ by less: a heading turns neither."""
+
+SAME_TURN, SAME_THRUST = 0.001, 0.001
+"""Body rates [rad/s], the numbers of `_down_and_nose` and thrusts are the same when they differ by
+less: nothing shapes them on their way, as a yaw rate is shaped."""
 
 LONGEST_LINK_US = US_PER_S
 """Longest time that a setpoint takes [µs]."""
@@ -78,6 +84,7 @@ def align(
     log: VehicleLog,
     sent_us: NDArray[np.int64],
     setpoints: NDArray[np.float64],
+    commands: CommandKind = "velocity",
 ) -> Alignment:
     """Return how the clocks of a recorded flight and of its vehicle's log relate.
 
@@ -85,7 +92,8 @@ def align(
         path: What telemetry told, by the companion's clock.
         log: The flight controller's.
         sent_us: (k,) when the companion sent setpoints [µs].
-        setpoints: (k, 4) forward, right, down [m/s], yaw rate [rad/s].
+        setpoints: (k, 4) forward, right, down [m/s], yaw rate [rad/s]; or as `commands` has them.
+        commands: What the setpoints command.
 
     Raises:
         UsageError: The log is of another flight, or nothing moved.
@@ -100,7 +108,7 @@ def align(
             f"{log.path}: its velocities agree with those of the recording by {correlation:.2f} at "
             f"best; accepted: the log of the same flight, {LEAST_CORRELATION:g} or more"
         )
-    low_us, high_us, count = _accepted(sent_us, setpoints, log, told_us)
+    low_us, high_us, count = _accepted(sent_us, setpoints, commands, log, told_us)
     known = count >= LEAST_SETPOINTS
     return Alignment(
         told_us=told_us,
@@ -186,24 +194,47 @@ def _correlation(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
 def _accepted(
     sent_us: NDArray[np.int64],
     setpoints: NDArray[np.float64],
+    commands: CommandKind,
     log: VehicleLog,
     told_us: float,
 ) -> tuple[float, float, int]:
     """Return the bounds [µs] of a setpoint's way, and how many of them agree."""
-    level = log.setpoint.values
-    # The heading turns neither speed nor yaw rate, so both are the same at both ends.
-    sent = np.stack([np.hypot(setpoints[:, 0], setpoints[:, 1]), setpoints[:, 3]], axis=1)
-    seen = np.stack([np.hypot(level[:, 0], level[:, 1]), level[:, 3]], axis=1)
-    near = np.array([SAME_SPEED_M_S, SAME_RATE_RAD_S])
     expected_us = np.asarray(sent_us - told_us, np.float64)
     bounds = [
-        *_bounds(expected_us, sent, Series(log.setpoint.time_us, seen), near),
-        *_bounds(expected_us, sent[:, 1:], log.yaw_rate_setpoint, near[1:]),
+        bound
+        for sent, seen, near in _looked_for(setpoints, commands, log)
+        for bound in _bounds(expected_us, sent, seen, np.array(near))
     ]
     if not bounds:
         return 0.0, 0.0, 0
     low_us, high_us, count = marzullo(np.array(bounds, np.float64))
     return low_us - told_us, high_us - told_us, count
+
+
+def _looked_for(
+    setpoints: NDArray[np.float64], commands: CommandKind, log: VehicleLog
+) -> Iterator[tuple[NDArray[np.float64], Series, tuple[float, ...]]]:
+    """Give what was sent (k, m), the topic (n, m) that shows it, and how much less differs (m,)."""
+    if commands == "body_rates":
+        yield setpoints, log.rates_setpoint, (*3 * (SAME_TURN,), SAME_THRUST)
+        return
+    if commands == "attitude":
+        turned = [quat_from_euler(*angles) for angles in setpoints[:, :3].tolist()]
+        sent = _down_and_nose(np.array(turned).reshape(-1, 4))
+        seen = log.attitude_setpoint
+        attitude = _down_and_nose(seen.values[:, :4])
+        yield (
+            np.column_stack([sent, setpoints[:, 3]]),
+            Series(seen.time_us, np.column_stack([attitude, seen.values[:, 4]])),
+            (*4 * (SAME_TURN,), SAME_THRUST),
+        )
+        return
+    level = log.setpoint.values
+    # The heading turns neither speed nor yaw rate, so both are the same at both ends.
+    sent = np.stack([np.hypot(setpoints[:, 0], setpoints[:, 1]), setpoints[:, 3]], axis=1)
+    seen_level = np.stack([np.hypot(level[:, 0], level[:, 1]), level[:, 3]], axis=1)
+    yield sent, Series(log.setpoint.time_us, seen_level), (SAME_SPEED_M_S, SAME_RATE_RAD_S)
+    yield sent[:, 1:], log.yaw_rate_setpoint, (SAME_RATE_RAD_S,)
 
 
 def _bounds(

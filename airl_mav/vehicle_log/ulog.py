@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pyulog import ULog
 from pyulog.exceptions import ULogException
 
+from airl_mav.core.constants import UNMEASURED_A
 from airl_mav.core.errors import UsageError
 
 Floats = NDArray[np.float64]
@@ -35,9 +36,13 @@ _TOPICS = (
     "vehicle_attitude_setpoint",
     "vehicle_local_position",
     "vehicle_local_position_setpoint",
+    "vehicle_rates_setpoint",
     "vehicle_status",
     "wind",
 )
+
+_THRUST = "thrust_body[2]"
+"""Of multicopters: along the body's axis down, so negative."""
 
 _BROKEN = (
     EOFError,
@@ -109,13 +114,17 @@ class VehicleLog:
     """Velocity that is tracked, north, east, down [m/s], and yaw rate [rad/s]."""
     yaw_rate_setpoint: Series
     """Yaw rate that is tracked [rad/s]; logged more often than `setpoint`."""
+    attitude_setpoint: Series
+    """Attitude that is tracked: w, x, y, z, body to world; then the thrust, 0 to 1."""
+    rates_setpoint: Series
+    """Body rates that are tracked, about forward, right, down [rad/s]; then the thrust, 0 to 1."""
     more_than_velocity: Series
     """Position and acceleration that are commanded beside a velocity, NaN where none is: north,
     east, down [m], then [m/s²]."""
     nav_state: Series
     """Mode, as `vehicle_status` numbers them."""
     battery: Series
-    """Voltage [V], current [A], charge that is left 1 to 0."""
+    """Voltage [V], current [A], NaN where none is measured, charge that is left 1 to 0."""
     wind: Series
     """Wind towards north, east, as the estimator believes [m/s]."""
     parameters: Mapping[str, float] = field(default_factory=dict)
@@ -155,16 +164,29 @@ def read_vehicle_log(path: Path) -> VehicleLog:
         yaw_rate_setpoint=_known(
             _series(topics, "vehicle_attitude_setpoint", ("yaw_sp_move_rate",))
         ),
+        attitude_setpoint=_upward(
+            _series(topics, "vehicle_attitude_setpoint", (*_numbered("q_d", 4), _THRUST))
+        ),
+        rates_setpoint=_upward(
+            _series(topics, "vehicle_rates_setpoint", ("roll", "pitch", "yaw", _THRUST))
+        ),
         more_than_velocity=_series(
             topics,
             "trajectory_setpoint",
             (*_numbered("position", 3), *_numbered("acceleration", 3)),
         ),
         nav_state=_series(topics, "vehicle_status", ("nav_state",)),
-        battery=_series(topics, "battery_status", ("voltage_v", "current_a", "remaining")),
+        battery=_battery(topics),
         wind=_known(_series(topics, "wind", ("windspeed_north", "windspeed_east"))),
         parameters={name: float(value) for name, value in read.initial_parameters.items()},
     )
+
+
+def _battery(topics: Mapping[str, Any]) -> Series:
+    """Return what the battery monitor measured; a current that it does not measure is NaN."""
+    told = _series(topics, "battery_status", ("voltage_v", "current_a", "remaining"))
+    told.values[told.values[:, 1] == UNMEASURED_A, 1] = np.nan
+    return told
 
 
 def _setpoint(topics: Mapping[str, Any]) -> Series:
@@ -190,6 +212,12 @@ def _known(series: Series) -> Series:
     """Return the samples that are numbers: motors that stand still are NaN."""
     there = np.isfinite(series.values).all(axis=1)
     return Series(series.time_us[there], series.values[there])
+
+
+def _upward(series: Series) -> Series:
+    """Return the samples that are numbers, their last column, a thrust, positive."""
+    known = _known(series)
+    return Series(known.time_us, np.column_stack([known.values[:, :-1], -known.values[:, -1]]))
 
 
 def _numbered(name: str, count: int) -> tuple[str, ...]:

@@ -11,15 +11,20 @@ import numpy as np
 import pytest
 
 from airl_mav import Scenario, rehearse
+from airl_mav.black_box.reading import read_black_box
 from airl_mav.core.frames import quat_to_euler
 from airl_mav.flight.judge import Outcome
-from airl_mav.latency.stamps import NO_STAMP
+from airl_mav.latency.stamps import NO_STAMP, SETPOINTS, commanded
 from airl_mav.lockstep.flight import fly
 from airl_mav.policy.actions import Attitude, BodyRates
 from airl_mav.policy.observation import Observation
 from airl_mav.rehearsal.run_folder import FlownEpisode, load
+from airl_mav.report.recorded_flight import path_of, stamps_of
 from airl_mav.scenario.resolve import resolve
+from airl_mav.vehicle_log.alignment import align
+from airl_mav.vehicle_log.ulog import read_vehicle_log
 from tests.support.processes import ROOT
+from tests.support.recorded_flights import fly_recorded
 
 POLICY = f"{ROOT / 'examples' / 'own_body_rates.py'}:ToGoal"
 
@@ -111,6 +116,33 @@ def test_late_body_rates_end_in_the_floor_where_late_velocities_fly() -> None:
     late = flown(POLICY, latency="120ms")
     assert late.record.outcome is Outcome.COLLISION
     assert flown("greedy", latency="120ms").record.outcome is Outcome.SUCCESS
+
+
+@pytest.mark.parametrize("policy", [POLICY, f"{__name__}:Leaning"])
+def test_the_vehicles_log_tells_when_setpoints_came(tmp_path: Path, policy: str) -> None:
+    scenario = Scenario(policy=policy, arena="no-obstacles", level="lockstep", latency="5ms")
+    flight = fly_recorded(resolve(scenario), 1, tmp_path)
+    assert flight.reason == "goal reached"
+    box, log = read_black_box(flight.black_box), read_vehicle_log(flight.ulg)
+    stamps = stamps_of(box)
+    kind = commanded(stamps)
+    setpoints = np.asarray(stamps[SETPOINTS[kind]], np.float64)
+    clocks = align(path_of(box), log, stamps["sent_us"], setpoints, kind)
+    assert clocks.setpoints > 40
+    assert clocks.accepted_range_us is not None
+    taken = flight.part("setpoints")
+    ways = []
+    for sent_us, setpoint in zip(stamps["sent_us"], setpoints, strict=True):
+        same = np.abs(taken["setpoint"] - setpoint).max(axis=1) < 1e-5
+        after = taken["accepted_us"][same & (taken["accepted_us"] >= sent_us)]
+        ways += (after[:1] - sent_us).tolist()
+    first_us, last_us = clocks.accepted_range_us
+    assert len(ways) > 0.9 * len(setpoints)
+    assert first_us <= np.median(ways) <= last_us
+    assert last_us - first_us <= 25_000
+    # Those of velocities are not there.
+    with_none = align(path_of(box), log, stamps["sent_us"], setpoints)
+    assert with_none.setpoints < 10
 
 
 @pytest.mark.parametrize("seed", [1, 2])

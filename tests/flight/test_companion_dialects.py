@@ -166,3 +166,28 @@ def test_px4_is_asked_for_two_streams_and_for_nothing_right_after_connecting(
         finally:
             pacer.stop()
     bench.server.close()
+
+
+@pytest.mark.parametrize(("sent_a", "told_a"), [(12.34, 12.34), (-1.0, None)])
+def test_a_current_that_px4_does_not_measure_is_not_known(
+    sent_a: float, told_a: float | None
+) -> None:
+    (port,), _ = free_ports(1, 0)
+    bench = Bench(
+        UdpEndpoint((LOOPBACK, 0), (LOOPBACK, port), local_option="local", remote_option="remote")
+    )
+    bench.autopilot.battery = bench.autopilot.battery._replace(current_a=sent_a)
+    pacer = Pacer(bench)
+    with link_on(port) as link:
+        pacer.start()
+        try:
+            link.connect(20.0)
+            # Of SYS_STATUS MAVSDK takes the voltage, of BATTERY_STATUS the current.
+            wait_for(lambda: math.isfinite(link._telemetry.battery().current_battery_a))
+            battery = link.battery()
+            assert battery.voltage_v == pytest.approx(15.8, abs=1e-3)
+            assert battery.current_a == (told_a if told_a is None else pytest.approx(told_a))
+            assert battery.remaining == pytest.approx(0.83)
+        finally:
+            pacer.stop()
+    bench.server.close()

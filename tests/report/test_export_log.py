@@ -16,6 +16,7 @@ import pytest
 from pyulog import ULog
 from scipy.spatial.transform import Rotation, Slerp
 
+from airl_mav import Scenario, rehearse
 from airl_mav.arena.generate import generate
 from airl_mav.black_box.messages import Decision, End, Latency, Phase, Telemetry
 from airl_mav.black_box.reading import read_black_box
@@ -37,6 +38,7 @@ from tests.support.command_line import airl, option_words
 from tests.support.flown_here import flown_here
 from tests.support.lenses import angles
 from tests.support.mcap_kit import ReadMcap, distances_to, protobuf_kind, read_mcap, turn_of, xyz
+from tests.support.processes import ROOT
 
 ENU_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 FLU_FROM_FRD = np.diag([1.0, -1.0, -1.0])
@@ -387,6 +389,44 @@ def test_a_flight_of_level_gym_has_px4s_topics(gym: Path, tmp_path: Path) -> Non
         texts = [each.message for each in log.logged_messages]
         assert texts[-1] == f"{record.outcome.value}: {record.reason}"
         assert not list(tmp_path.glob("*.part"))
+
+
+def test_body_rates_and_attitudes_have_px4s_topics(tmp_path: Path) -> None:
+    """Of a flight in lockstep, beside which stands what the flight controller has logged."""
+    policy = f"{ROOT / 'examples' / 'own_body_rates.py'}:ToGoal"
+    scenario = Scenario(policy=policy, arena="no-obstacles", level="lockstep", tlogs=True)
+    rehearse(scenario, out=tmp_path / "run")
+    flight = recorded(tmp_path / "run")
+    rows: dict[str, list[tuple[float, ...]]] = {}
+    for time_us, topic, values in samples(flight):
+        rows.setdefault(topic, []).append((time_us, *values))
+    assert "trajectory_setpoint" not in rows and "vehicle_attitude_setpoint" not in rows
+    made = np.array(rows["vehicle_rates_setpoint"])
+    own = ULog(str(tmp_path / "run" / "flight-000.ulg")).get_dataset("vehicle_rates_setpoint").data
+    # They are followed after half a second; later both are the newest, one tick apart at most.
+    later = made[made[:, 0] > made[0, 0] + 600_000]
+    assert len(later) > 200
+    names = ("roll", "pitch", "yaw", "thrust_body[0]", "thrust_body[1]", "thrust_body[2]")
+    newest = np.searchsorted(own["timestamp"], later[:, 0], side="right") - 1
+    for column, name in enumerate(names, start=1):
+        near = np.abs(later[:, column] - own[name][newest]) < 1e-5
+        near |= (
+            np.abs(later[:, column] - own[name][(newest + 1).clip(max=len(own[name]) - 1)]) < 1e-5
+        )
+        assert near.mean() > 0.9, name
+    # The same numbers as an attitude: PX4's quaternion, as scipy turns it.
+    stamps = dict(flight.replayed.stamps)
+    stamps["attitude_setpoint"] = stamps.pop("rates_setpoint")
+    leaning = replace(flight, replayed=replace(flight.replayed, stamps=stamps))
+    told = [each for each in samples(leaning) if each[1] == "vehicle_attitude_setpoint"]
+    assert len(told) > 100
+    sent = np.searchsorted(stamps["sent_us"], [each[0] for each in told], side="right") - 1
+    roll, pitch, yaw, thrust = stamps["attitude_setpoint"][sent].astype(float).T
+    turned = Rotation.from_euler("ZYX", np.stack([yaw, pitch, roll], axis=1))
+    turns = np.array([each[2] for each in told], float)
+    apart = Rotation.from_quat(turns[:, 1:5], scalar_first=True) * turned.inv()
+    assert apart.magnitude().max() < 1e-6
+    np.testing.assert_allclose(turns[:, 7], -thrust)
 
 
 def test_the_vehicles_own_log_is_taken_where_there_is_one(lockstep: Path, tmp_path: Path) -> None:

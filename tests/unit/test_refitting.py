@@ -23,6 +23,8 @@ from airl_mav.refitting.response import TELEMETRY_AGE_S, fit_response
 from airl_mav.refitting.thrust import fit_thrust
 from airl_mav.vehicle_log.alignment import marzullo
 from airl_mav.vehicle_log.ulog import Series, VehicleLog, empty, read_vehicle_log
+from firmware_sim.flight_log.topics import TOPICS
+from firmware_sim.flight_log.ulog import UlogWriter
 
 QUAD = load_vehicle("quad")
 STILL = np.zeros(0, np.int64)
@@ -135,6 +137,7 @@ def logged(
     }
     widths = {"motors": 4, "specific_force": 3, "setpoint": 4, "yaw_rate_setpoint": 1}
     widths |= {"more_than_velocity": 6, "nav_state": 1, "battery": 3, "wind": 2}
+    widths |= {"attitude_setpoint": 5, "rates_setpoint": 4}
     held |= {name: empty(width) for name, width in widths.items()}
     log = VehicleLog(Path("made.ulg"), **held)
     turned = replace(path, quaternion=tilted)
@@ -251,3 +254,23 @@ def test_what_is_no_log_is_refused_in_a_line(tmp_path: Path, content: bytes) -> 
         read_vehicle_log(path)
     with pytest.raises(UsageError, match="No such file"):
         read_vehicle_log(tmp_path / "none.ulg")
+
+
+def test_a_current_that_px4_does_not_measure_is_no_number(tmp_path: Path) -> None:
+    path = tmp_path / "x.ulg"
+    topics = {logged.topic.name: logged.topic for logged in TOPICS}
+    names = ("vehicle_attitude", "vehicle_local_position", "battery_status")
+    writer = UlogWriter(path, 0, [topics[name] for name in names], (), ())
+    for k, current_a in enumerate((12.5, -1.0)):
+        for number, name in enumerate(names):
+            known = {"current_a": current_a, "voltage_v": 15.5, "timestamp_sample": k + 1}
+            values: list[float] = []
+            for field in topics[name].fields:
+                kind, _, field_name = field.partition(" ")
+                length = int(kind.rstrip("]").partition("[")[2] or 1)
+                values += [known.get(field_name, 0)] * length
+            writer.sample(number, k + 1, tuple(values))
+    writer.close()
+    battery = read_vehicle_log(path).battery.values
+    np.testing.assert_array_equal(battery[:, 0], 15.5)
+    np.testing.assert_array_equal(battery[:, 1], [12.5, np.nan])

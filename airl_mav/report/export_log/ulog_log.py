@@ -7,17 +7,18 @@ holds them. A field that is not known is NaN, or 0 where it is no float.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from airl_mav.core.frames import quats_to_euler
+from airl_mav.core.frames import quat_from_euler, quats_to_euler
 from airl_mav.flight.smoothness import commanded_velocity
 from airl_mav.flight.trajectory import Trajectory
-from airl_mav.latency.stamps import SETPOINT
+from airl_mav.latency.stamps import ATTITUDE, RATES, SETPOINT
 from airl_mav.report.export_log.recorded import RecordedFlight, charge_of
 from airl_mav.report.replay.flight import INFO, STANDING_M, WARNING
 from firmware_sim.autopilot.autopilot_state import Mode
@@ -45,6 +46,8 @@ NAMES = (
     "vehicle_local_position",
     "vehicle_local_position_groundtruth",
     "vehicle_local_position_setpoint",
+    "vehicle_attitude_setpoint",
+    "vehicle_rates_setpoint",
     "battery_status",
     "vehicle_status",
     "actuator_armed",
@@ -151,28 +154,51 @@ def _motion(path: Trajectory, suffix: str) -> Iterator[Sample]:
 
 
 def _setpoints(flight: RecordedFlight) -> Iterator[Sample]:
-    """Give the commanded velocity, NED, and yaw rate, while the policy flies."""
-    columns, path = flight.decisions, flight.replayed.path
-    if not len(columns.get(SETPOINT, ())):
-        return  # no velocity is commanded
+    """Give what the companion commands, while the policy flies."""
+    columns = flight.decisions
+    if len(columns.get(SETPOINT, ())):
+        yield from _velocity_setpoints(flight, columns)
+    if len(columns.get(ATTITUDE, ())):
+        name = "vehicle_attitude_setpoint"
+        for time_us, newest in _commanded(flight, _LOGGED[name].interval_us):
+            *angles, thrust = columns[ATTITUDE][newest].tolist()
+            q_d = quat_from_euler(*angles)
+            yield time_us, name, row(name, q_d=q_d, thrust_body=(0.0, 0.0, -thrust))
+    if len(columns.get(RATES, ())):
+        name = "vehicle_rates_setpoint"
+        for time_us, newest in _commanded(flight, _LOGGED[name].interval_us):
+            *rates, thrust = columns[RATES][newest].tolist()
+            turns = dict(zip(("roll", "pitch", "yaw"), rates, strict=True))
+            yield time_us, name, row(name, **turns, thrust_body=(0.0, 0.0, -thrust))
+
+
+def _velocity_setpoints(
+    flight: RecordedFlight, columns: Mapping[str, NDArray[Any]]
+) -> Iterator[Sample]:
+    """Give the commanded velocity, NED, and yaw rate."""
+    path = flight.replayed.path
     velocities = commanded_velocity(path, columns, path.time_us)
-    which = np.searchsorted(columns["sent_us"], path.time_us, side="right") - 1
     tracked = "vehicle_local_position_setpoint"
-    for name, interval_us in (
-        (tracked, _LOGGED[tracked].interval_us),
-        (TRAJECTORY_SETPOINT.name, SETPOINT_US),
-    ):
-        for i in _every(path, interval_us):
-            time_us = int(path.time_us[i])
-            if which[i] < 0 or not flight.navigates(time_us):
-                continue
-            turn = float(columns[SETPOINT][which[i], 3])
-            velocity = velocities[i].tolist()
-            if name == tracked:
-                speeds = dict(zip(("vx", "vy", "vz"), velocity, strict=True))
-                yield time_us, name, row(name, **speeds, yawspeed=turn)
-            else:
-                yield time_us, name, row(name, velocity=velocity, yawspeed=turn)
+    for time_us, newest in _commanded(flight, _LOGGED[tracked].interval_us):
+        velocity = velocities[np.searchsorted(path.time_us, time_us)].tolist()
+        speeds = dict(zip(("vx", "vy", "vz"), velocity, strict=True))
+        turn = float(columns[SETPOINT][newest, 3])
+        yield time_us, tracked, row(tracked, **speeds, yawspeed=turn)
+    for time_us, newest in _commanded(flight, SETPOINT_US):
+        velocity = velocities[np.searchsorted(path.time_us, time_us)].tolist()
+        turn = float(columns[SETPOINT][newest, 3])
+        name = TRAJECTORY_SETPOINT.name
+        yield time_us, name, row(name, velocity=velocity, yawspeed=turn)
+
+
+def _commanded(flight: RecordedFlight, interval_us: int) -> Iterator[tuple[int, int]]:
+    """Give times of the path [µs] at which the policy flies, and its newest decision then."""
+    path = flight.replayed.path
+    which = np.searchsorted(flight.decisions["sent_us"], path.time_us, side="right") - 1
+    for i in _every(path, interval_us):
+        time_us = int(path.time_us[i])
+        if which[i] >= 0 and flight.navigates(time_us):
+            yield time_us, int(which[i])
 
 
 def _battery(flight: RecordedFlight) -> Iterator[Sample]:
