@@ -243,14 +243,17 @@ def compare_pairs(
     return PairedComparison(
         agreement=agreement,
         success_rate=_compare_rates(agreement),
-        **{
-            name: compare_means(
-                [getattr(first, name) for first, _ in good],
-                [getattr(second, name) for _, second in good],
-            )
-            for name in MEANS
-        },
+        **{name: compare_means(*_known_by_both(good, name)) for name in MEANS},
     )
+
+
+def _known_by_both(
+    good: Sequence[tuple[Quality, Quality]], name: str
+) -> tuple[list[float], list[float]]:
+    """Return a measure of the pairs of which both flights have it."""
+    values = [(getattr(first, name), getattr(second, name)) for first, second in good]
+    both = [pair for pair in values if None not in pair]
+    return [first for first, _ in both], [second for _, second in both]
 
 
 def _compare_rates(agreement: Agreement) -> Change:

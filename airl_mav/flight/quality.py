@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -29,8 +30,8 @@ class Leg:
     time_s: float
     distance_m: float
     """Path length in three dimensions [m]."""
-    energy_j: float
-    """Electrical energy of the vehicle, without its computer [J]."""
+    energy_j: float | None
+    """Electrical energy of the vehicle, without its computer [J]; None: nobody measured it."""
 
 
 @dataclass(frozen=True)
@@ -40,8 +41,8 @@ class Quality:
     flight_time_s: float
     distance_m: float
     """Path length in three dimensions [m]."""
-    energy_j: float
-    """Electrical energy of the vehicle, without its computer [J]."""
+    energy_j: float | None
+    """Electrical energy of the vehicle, without its computer [J]; None: nobody measured it."""
     computer_energy_j: float
     """Energy of the onboard computer: its watts times the flight time; 0 on the ground [J]."""
     mean_speed_m_s: float
@@ -69,19 +70,20 @@ class Quality:
     command_step_max_m_s: float | None = None
 
     @property
-    def total_energy_j(self) -> float:
+    def total_energy_j(self) -> float | None:
         """Energy of vehicle and computer together [J]."""
-        return self.energy_j + self.computer_energy_j
+        return None if self.energy_j is None else self.energy_j + self.computer_energy_j
 
 
 def measure_leg(trajectory: Trajectory, start_us: int, end_us: int) -> Leg:
     """Measure the part of a flight between two simulated times [µs]."""
     part = trajectory.between(start_us, end_us)
     steps_s = np.diff(part.time_us) / US_PER_S
+    energy_j = float(np.sum(part.power_w[1:] * steps_s))
     return Leg(
         time_s=(end_us - start_us) / US_PER_S,
         distance_m=float(np.linalg.norm(np.diff(part.position, axis=0), axis=1).sum()),
-        energy_j=float(np.sum(part.power_w[1:] * steps_s)),
+        energy_j=energy_j if math.isfinite(energy_j) else None,
     )
 
 
@@ -115,7 +117,7 @@ def measure_quality(
     speed = trajectory.between(navigation_us, ended_us).speed()
     began_us = min(int(trajectory.time_us[0]), navigation_us) if len(trajectory) else navigation_us
     computer_j = computer_watts * leg.time_s
-    spent_j = leg.energy_j + computer_j
+    spent_j = 0.0 if leg.energy_j is None else leg.energy_j + computer_j
     missions = None if pack_j is None or spent_j <= 0.0 else pack_j / spent_j
     return Quality(
         flight_time_s=leg.time_s,

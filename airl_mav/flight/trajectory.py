@@ -23,7 +23,7 @@ class Trajectory:
     quaternion: NDArray[np.float64]  # (n, 4) [w, x, y, z] body -> world
     power_w: NDArray[np.float64]  # (n,) electrical power of the vehicle, without its computer
     """Mean over the time since the sample before, so that power times time adds up to the energy
-    that was integrated at the full tick rate."""
+    that was integrated at the full tick rate; NaN where nobody measured it."""
 
     def __post_init__(self) -> None:
         """Check shapes and order. Raises ValueError."""

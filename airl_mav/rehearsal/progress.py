@@ -103,10 +103,10 @@ class LiveObserver(Observer):
         quality = record.quality
         figures = ""
         if quality is not None:
-            figures = (
-                f"{quality.flight_time_s:6.1f} s {quality.distance_m:6.1f} m "
-                f"{quality.energy_j / 1e3:6.2f} kJ  "
-            )
+            figures = f"{quality.flight_time_s:6.1f} s {quality.distance_m:6.1f} m "
+            if quality.energy_j is not None:
+                figures += f"{quality.energy_j / 1e3:6.2f} kJ "
+            figures += " "
         self._progress.note(
             f"  flight {record.index:03d}  seed {record.seed:<5} "
             f"{record.outcome.value:<10}{figures}{record.reason}",

@@ -50,12 +50,18 @@ class FlightEnergy:
 
     record: EpisodeRecord
     quality: Quality
+    airframe_j: float
     parts: EnergySplit | None
     """None where the vehicle or the recording is missing."""
 
+    @property
+    def total_j(self) -> float:
+        """That of airframe and computer."""
+        return self.airframe_j + self.quality.computer_energy_j
+
 
 def flight_energies(run: LoadedRun, vehicle: VehicleProfile | None) -> list[FlightEnergy]:
-    """Return the energies of all flights that navigated, in the order flown.
+    """Return the energies, where they are known, of all flights that navigated, as they were flown.
 
     Args:
         run: The run.
@@ -66,13 +72,15 @@ def flight_energies(run: LoadedRun, vehicle: VehicleProfile | None) -> list[Flig
     for e in run.episodes:
         if e.quality is None or e.navigation_us is None or e.outcome is Outcome.ABORTED:
             continue
+        if e.quality.energy_j is None:
+            continue
         path = run.trajectories.get(e.index)
         parts = (
             None
             if path is None or vehicle is None or len(path) < 2
             else split_energy(path, e.navigation_us, e.ended_us, vehicle, watts)
         )
-        flights.append(FlightEnergy(e, e.quality, parts))
+        flights.append(FlightEnergy(e, e.quality, e.quality.energy_j, parts))
     return flights
 
 
@@ -88,7 +96,7 @@ def energy_table(flights: Sequence[FlightEnergy], *, on_ground: bool = False) ->
         Column("mean power", "W"),
     )
     time_s = sum(f.quality.flight_time_s for f in flights)
-    airframe = sum(f.quality.energy_j for f in flights)
+    airframe = sum(f.airframe_j for f in flights)
     computer = sum(f.quality.computer_energy_j for f in flights)
     whole = airframe + computer
     splits = [f.parts for f in flights if f.parts is not None]
@@ -144,7 +152,7 @@ def _flight_row(flight: FlightEnergy) -> tuple[str, ...]:
     return (
         f"{flight.record.index}",
         *parts,
-        f"{q.total_energy_j / q.flight_time_s:,.1f}" if q.flight_time_s else NONE,
+        f"{flight.total_j / q.flight_time_s:,.1f}" if q.flight_time_s else NONE,
     )
 
 
@@ -156,7 +164,7 @@ def energy_figure(flights: Sequence[FlightEnergy], *, on_ground: bool = False) -
     ranked = list(flights)
     kept = np.arange(len(ranked))
     if many:
-        ranked.sort(key=lambda f: f.quality.total_energy_j)
+        ranked.sort(key=lambda f: f.total_j)
         kept = np.unique(np.linspace(0, len(ranked) - 1, RANKS).round().astype(int))
         ranked = [ranked[k] for k in kept]
     whole = all(f.parts is not None for f in flights)
@@ -175,7 +183,7 @@ def energy_figure(flights: Sequence[FlightEnergy], *, on_ground: bool = False) -
     top = HIGH * float(np.percentile(above, 95.0))
     if above.max() > top > 0.0:
         ax.set_ylim(top=top)
-        over = sum(f.quality.total_energy_j > 1e3 * top for f in flights)
+        over = sum(f.total_j > 1e3 * top for f in flights)
         ax.set_title(
             f"{over} above, up to {above.max():,.0f} kJ",
             loc="right",
@@ -208,5 +216,5 @@ def _joules(flight: FlightEnergy, name: str) -> float:
     if name == "computer_j":
         return flight.quality.computer_energy_j
     if not name or flight.parts is None:
-        return flight.quality.energy_j
+        return flight.airframe_j
     return float(getattr(flight.parts, name))

@@ -68,7 +68,7 @@ def flight_data(
         "flown": _lines(flight.flown, keep),
         "estimated": None if flight.estimated is None else _lines(flight.estimated, keep),
         "errors": None if flight.errors is None else _lines(flight.errors, keep),
-        "power": steps_of(flight.power_w[keep], 1.0),
+        "power": None if flight.power_w is None else steps_of(flight.power_w[keep], 1.0),
         "motors": None if flight.motors is None else _outputs(flight.motors[keep]),
         "altitude": flight.altitude_m,
         "commands": {

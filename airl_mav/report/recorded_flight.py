@@ -173,7 +173,7 @@ def stamps_of(box: BlackBox) -> dict[str, NDArray[Any]]:
 def _power_w(statuses: list[Status], times_us: NDArray[np.int64]) -> NDArray[np.float64]:
     """Return the power (n,) at times (n,): the newest that was told, the first one before it.
 
-    Older recordings hold PX4's -1 A where it measures no current.
+    NaN where none was measured. Older recordings hold PX4's -1 A where it measures no current.
     """
     told = [
         (status.time_us, status.voltage_v * status.current_a)
@@ -183,7 +183,7 @@ def _power_w(statuses: list[Status], times_us: NDArray[np.int64]) -> NDArray[np.
         and status.current_a != UNMEASURED_A
     ]
     if not told:
-        return np.zeros(len(times_us))
+        return np.full(len(times_us), np.nan)
     at_us, power_w = np.array(told).T
     newest = np.searchsorted(at_us, times_us, side="right") - 1
     return np.asarray(power_w[np.maximum(newest, 0)], np.float64)

@@ -148,11 +148,11 @@ def _episode_row(episode: EpisodeRecord, *, computer: bool) -> tuple[str, ...]:
         else (
             f"{q.flight_time_s:.2f}",
             f"{q.distance_m:.2f}",
-            f"{q.energy_j / 1e3:.2f}",
+            _kilojoules(q.energy_j),
             f"{q.mean_speed_m_s:.2f}",
             f"{q.max_speed_m_s:.2f}",
             *([f"{q.computer_energy_j:,.0f}"] if computer else []),
-            f"{q.takeoff.time_s:.2f}, {q.takeoff.energy_j / 1e3:.2f}",
+            f"{q.takeoff.time_s:.2f}, {_kilojoules(q.takeoff.energy_j)}",
         )
     )
     battery = episode.battery_remaining
@@ -160,6 +160,10 @@ def _episode_row(episode: EpisodeRecord, *, computer: bool) -> tuple[str, ...]:
     why = "; ".join([episode.reason, *episode.notes])
     label = OUTCOME_LABELS[episode.outcome]
     return (f"{episode.index}", f"{episode.seed}", label, *figures, left, why)
+
+
+def _kilojoules(joules: float | None) -> str:
+    return NONE if joules is None else f"{joules / 1e3:.2f}"
 
 
 def quality_table(summary: RunSummary, *, computer: bool = True) -> TableView:

@@ -100,7 +100,8 @@ class TrackedFlight:
     commands: Commands
     altitude_m: float | None
     """Height that was to be held."""
-    power_w: Floats
+    power_w: Floats | None
+    """None: nobody measured it."""
     motors: Floats | None
     """(m, 4) motor outputs 0 to 1, in PX4's order; None: not recorded."""
 
@@ -134,7 +135,7 @@ def track(run: LoadedRun, record: EpisodeRecord) -> TrackedFlight | None:
         commands=commands,
         # Who commands no velocity holds a height of its own.
         altitude_m=pilot.get("altitude_m") if commanded(stamps) == "velocity" else None,
-        power_w=path.power_w,
+        power_w=path.power_w if np.isfinite(path.power_w).all() else None,
         motors=_motors(stamps, path.time_us),
     )
 

@@ -133,7 +133,8 @@ def _rows(flight: TrackedFlight) -> list[tuple[str, list[_Line]]]:
     if errors is not None:
         away = [_Line(errors.aside_m, ESTIMATED), _Line(errors.height_m, ESTIMATED, ":")]
         rows.append(("est. error [m]\nheight: dotted", away))
-    rows.append(("power\n[W]", [_Line(flight.power_w, FLOWN)]))
+    if flight.power_w is not None:
+        rows.append(("power\n[W]", [_Line(flight.power_w, FLOWN)]))
     if flight.motors is not None:
         rows.append(("motor\noutputs", [_Line(each, FLOWN, "-", 0.7) for each in flight.motors.T]))
     return rows
@@ -154,7 +155,7 @@ def _draw_row(
     t = flight.time_s
     for line in lines:
         power = line.values is flight.power_w
-        values = _mean_power(flight, keep) if power else line.values[keep]
+        values = _mean_power(t, line.values, keep) if power else line.values[keep]
         ax.plot(t[keep], values, color=line.colour, ls=line.dashes, lw=line.wide)
     theme.label_axes(ax, y=label)
     ax.yaxis.label.set_fontsize(7.5)
@@ -168,12 +169,12 @@ def _draw_row(
     ax.set_xlim(t[keep[0]], t[-1])
 
 
-def _mean_power(flight: TrackedFlight, keep: NDArray[np.int64]) -> Floats:
+def _mean_power(time_s: Floats, power_w: Floats, keep: NDArray[np.int64]) -> Floats:
     """Return the mean power between kept samples: it is a mean since the sample before."""
-    steps = np.diff(flight.time_s, prepend=flight.time_s[0] - 1e-6)
-    energy = np.cumsum(flight.power_w * steps)
-    passed = flight.time_s[keep] - flight.time_s[0] + 1e-6
-    first = flight.power_w[keep[0]]
+    steps = np.diff(time_s, prepend=time_s[0] - 1e-6)
+    energy = np.cumsum(power_w * steps)
+    passed = time_s[keep] - time_s[0] + 1e-6
+    first = power_w[keep[0]]
     power: Floats = np.append(first, np.diff(energy[keep]) / np.diff(passed))
     return power
 

@@ -12,7 +12,16 @@ from pydantic import TypeAdapter
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
-from airl_mav.black_box.messages import Decision, End, Log, Phase, RawImage, Resources, Telemetry
+from airl_mav.black_box.messages import (
+    Decision,
+    End,
+    Log,
+    Phase,
+    RawImage,
+    Resources,
+    Status,
+    Telemetry,
+)
 from airl_mav.black_box.reading import read_black_box
 from airl_mav.black_box.writing import BlackBoxFile
 from airl_mav.cli.report import ReportOptions
@@ -144,6 +153,36 @@ def test_it_is_judged_as_a_rehearsal_is(recorded: Recorded, run: Run) -> None:
     assert record.quality.energy_j == pytest.approx(true_j, rel=0.1)
     straight_m = np.hypot(*record.goal) - record.goal_radius_m
     assert straight_m - 0.5 < record.quality.distance_m < 1.5 * straight_m
+
+
+@pytest.mark.parametrize("told_a", [None, -1.0])
+def test_where_no_current_is_measured_there_is_no_energy(
+    recorded: Recorded, run: Run, tmp_path: Path, told_a: float | None
+) -> None:
+    """As by the battery of a simulated PX4: older recordings hold its -1 A."""
+    box = read_black_box(recorded.path)
+    file = BlackBoxFile(tmp_path / "flight.mcap", box.run)
+    for messages in box.messages.values():
+        for message in messages:
+            status = isinstance(message, Status)
+            file.write(replace(message, current_a=told_a) if status else message, 0)
+    file.finish()
+    console = Console(record=True, width=100, quiet=True)
+    assert report(ReportOptions(runs=(tmp_path / "flight.mcap",)), console) == 0
+    ours = load_run(tmp_path / "flight")
+    (record,) = ours.episodes
+    assert record.quality is not None
+    assert record.quality.energy_j is None and record.quality.total_energy_j is None
+    assert record.quality.takeoff.energy_j is None and record.quality.endurance_s is None
+    assert record.quality.distance_m > 10.0
+    page = (tmp_path / "flight" / "report.html").read_text(encoding="utf-8")
+    assert "Energy without the computer" in page and "Mean power: of airframe" not in page
+    assert not (tmp_path / "flight" / "energy.png").exists()
+    # One of both knows it: the rest is compared.
+    console = Console(record=True, width=100, quiet=True)
+    assert report(ReportOptions(runs=(run.path, ours.path), out=tmp_path / "both"), console) == 0
+    told = console.export_text()
+    assert "nan" not in told.lower()
 
 
 def test_airl_report_shows_it_and_what_a_crash_left_of_it(

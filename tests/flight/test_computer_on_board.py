@@ -71,6 +71,7 @@ def test_the_page_charges_no_computer_on_the_ground(runs: dict[str, LoadedRun]) 
     rows = {row[0]: row[1] for row in quality_table(summarize_run(run)).rows}
     # A fifth of 5.2 Ah, at 14 V empty and 14.56 V at the start.
     pack_j = 0.2 * 5.2 * 3600 * 14.28
+    assert quality.energy_j is not None
     lasts_s = pack_j * quality.flight_time_s / quality.energy_j
     assert quality.endurance_s == pytest.approx(lasts_s)
     assert rows["endurance"] == f"{lasts_s / 60.0:,.1f} min"

@@ -182,6 +182,7 @@ def test_quality_is_that_of_the_path(greedy: tuple[LoadedRun, str]) -> None:
         length = np.linalg.norm(np.diff(path.position, axis=0), axis=1).sum()
         assert q.distance_m == pytest.approx(length)
         # A hovering Iris-class vehicle draws some 190 W; the workstation stays on the ground.
+        assert q.energy_j is not None
         assert 150.0 < q.energy_j / q.flight_time_s < 260.0
         assert q.computer_energy_j == 0.0
         assert q.endurance_s is not None

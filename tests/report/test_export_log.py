@@ -31,7 +31,7 @@ from airl_mav.profiles.loading import load_profile
 from airl_mav.rehearsal.run_folder import LoadedRun, load
 from airl_mav.report.export_log.files import flight_of
 from airl_mav.report.export_log.recorded import RecordedFlight
-from airl_mav.report.export_log.ulog_log import row, samples
+from airl_mav.report.export_log.ulog_log import row, samples, write_ulog
 from airl_mav.report.recorded_flight import episode_of
 from airl_mav.report.replay.runs import ReplayedRun
 from tests.support.command_line import airl, option_words
@@ -391,6 +391,25 @@ def test_a_flight_of_level_gym_has_px4s_topics(gym: Path, tmp_path: Path) -> Non
         assert not list(tmp_path.glob("*.part"))
 
 
+def test_a_flight_that_began_before_its_clock_is_later_by_as_much(
+    gym: Path, tmp_path: Path
+) -> None:
+    """As one with a vehicle's log, whose clock is that of a companion that was started later."""
+    flight = recorded(gym)
+    path = flight.replayed.path
+    earlier = replace(path, time_us=path.time_us - 5_000_000)
+    write_ulog(replace(flight, replayed=replace(flight.replayed, path=earlier)), tmp_path / "x.ulg")
+    log = ULog(str(tmp_path / "x.ulg"))
+    assert log.start_timestamp == 0 and not log.file_corruption
+    truth = log.get_dataset("vehicle_local_position_groundtruth").data
+    np.testing.assert_array_equal(truth["timestamp"], truth["timestamp_sample"])
+    rows = np.searchsorted(earlier.time_us, truth["timestamp"].astype(np.int64) - 5_000_000)
+    assert len(rows) > 10
+    np.testing.assert_allclose(truth["x"], path.position[rows, 0], atol=1e-4)
+    said_us = log.logged_messages[-1].timestamp
+    assert said_us == flight.replayed.record.ended_us + 5_000_000
+
+
 def test_body_rates_and_attitudes_have_px4s_topics(tmp_path: Path) -> None:
     """Of a flight in lockstep, beside which stands what the flight controller has logged."""
     policy = f"{ROOT / 'examples' / 'own_body_rates.py'}:ToGoal"
@@ -579,7 +598,6 @@ def test_a_folder_that_is_a_file_is_one_line(gym: Path, tmp_path: Path) -> None:
 
 
 def test_a_full_disk_leaves_what_was_there(gym: Path, tmp_path: Path) -> None:
-    from airl_mav.report.export_log.ulog_log import write_ulog
     from tests.support.full_disk import largest_file
 
     path = tmp_path / "flight-000.ulg"

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import re
 import xml.etree.ElementTree as ET
 from dataclasses import replace
@@ -312,7 +313,7 @@ def test_the_energy_table_adds_up(demo: tuple[LoadedRun, dict[int, Arena]]) -> N
     energies = flight_energies(run, load_vehicle("quad"))
     view = energy_table(energies)
     kj = {row[0]: float(row[1]) for row in view.rows}
-    airframe = sum(e.quality.energy_j for e in run.episodes if e.quality) / 1e3
+    airframe = sum(e.quality.energy_j or math.nan for e in run.episodes if e.quality) / 1e3
     assert kj["airframe"] == pytest.approx(airframe, abs=0.01)
     parts = kj["– hovering"] + kj["– speed"] + kj["– manoeuvres"]
     assert parts == pytest.approx(kj["airframe"], abs=0.03)
@@ -322,7 +323,7 @@ def test_the_energy_table_adds_up(demo: tuple[LoadedRun, dict[int, Arena]]) -> N
     listed = energy_flights_table(energies, 200)
     for row in listed.rows:
         quality = run.episodes[int(row[0])].quality
-        assert quality is not None
+        assert quality is not None and quality.energy_j is not None
         parts = sum(float(cell) for cell in row[1:4])
         assert parts == pytest.approx(quality.energy_j / 1e3, abs=0.02)
 

@@ -214,6 +214,7 @@ def _hold(config: Mapping[str, Any]) -> float | None:
 def _navigation_start(run: LoadedRun, tests: Sequence[EpisodeRecord]) -> NavigationStart | None:
     """Return where navigation begins."""
     rows = []
+    energies: list[float] = []
     for episode in tests:
         path = run.trajectories.get(episode.index)
         if path is None or episode.navigation_us is None or episode.quality is None:
@@ -222,11 +223,14 @@ def _navigation_start(run: LoadedRun, tests: Sequence[EpisodeRecord]) -> Navigat
         if len(at):
             takeoff = episode.quality.takeoff
             (north, east, down), speed = at.position[0], at.speed()[0]
-            leg = (takeoff.time_s, takeoff.distance_m, takeoff.energy_j)
+            leg = (takeoff.time_s, takeoff.distance_m)
             rows.append((*leg, float(np.hypot(north, east)), -down, speed))
+            energies += [] if takeoff.energy_j is None else [takeoff.energy_j]
     if not rows:
         return None
-    return NavigationStart(len(rows), *(float(mean) for mean in np.mean(rows, axis=0)))
+    time_s, distance_m, *place = (float(mean) for mean in np.mean(rows, axis=0))
+    energy_j = float(np.mean(energies)) if len(energies) == len(rows) else None
+    return NavigationStart(len(rows), time_s, distance_m, energy_j, *place)
 
 
 def _position_error(run: LoadedRun, tests: Sequence[EpisodeRecord]) -> float | None:

@@ -74,7 +74,9 @@ def _start_row(run: ComparedRun) -> tuple[str, ...]:
     told = NONE if error is None else f"{error:.2f}"
     if start is None:
         return (run.mark, "0", *(NONE,) * 5, told)
-    takeoff = (f"{start.takeoff_s:.2f}", f"{start.takeoff_energy_j / 1e3:.2f}")
+    energy_j = start.takeoff_energy_j
+    energy = NONE if energy_j is None else f"{energy_j / 1e3:.2f}"
+    takeoff = (f"{start.takeoff_s:.2f}", energy)
     if not start.takeoff_s:
         takeoff = ("none", NONE)
     place = (f"{start.aside_m:.2f}", f"{start.height_m:.2f}", f"{start.speed_m_s:.2f}")

@@ -79,7 +79,8 @@ class NavigationStart:
     takeoff_s: float
     """Time from the reset to the start of navigation [s]; 0: the level begins in a hover."""
     takeoff_distance_m: float
-    takeoff_energy_j: float
+    takeoff_energy_j: float | None
+    """None: not measured in all of them [J]."""
     aside_m: float
     """Distance from the vehicle's place at the reset, seen from above [m]."""
     height_m: float

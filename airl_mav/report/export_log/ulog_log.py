@@ -65,13 +65,17 @@ Sample = tuple[int, str, Values]
 def write_ulog(flight: RecordedFlight, path: Path) -> None:
     """Write a flight; what is there already is replaced.
 
+    A flight with a vehicle's log may begin before the companion did, whose clock it has: times of a
+    ULog are not negative, so all are then later by as much.
+
     Raises:
         OSError: It cannot be written.
     """
-    start_us = int(flight.replayed.path.time_us[0])
+    began_us = int(flight.replayed.path.time_us[0])
+    later_us = max(0, -began_us)
     writer = UlogWriter(
         path,
-        start_us,
+        began_us + later_us,
         EXPORTED,
         (("sys_name", "airl-mav export-log"), *DESCRIBED),
         (),
@@ -81,9 +85,9 @@ def write_ulog(flight: RecordedFlight, path: Path) -> None:
         rows: list[tuple[int, str, Any]] = [*samples(flight), *texts]
         for time_us, name, values in sorted(rows, key=itemgetter(0)):
             if name:
-                writer.sample(_NUMBER[name], time_us, values)
+                writer.sample(_NUMBER[name], time_us + later_us, _later(name, values, later_us))
             else:
-                writer.text(time_us, *values)
+                writer.text(time_us + later_us, *values)
         writer.flush()
         if writer.failure is not None:
             raise OSError(writer.failure.errno, writer.failure.strerror, str(path))
@@ -91,6 +95,13 @@ def write_ulog(flight: RecordedFlight, path: Path) -> None:
     except BaseException:
         writer.discard()
         raise
+
+
+def _later(topic: str, values: Values, later_us: int) -> Values:
+    """Return a topic's values with the time of what was sampled so much later [µs]."""
+    if not later_us or "uint64_t timestamp_sample" not in EXPORTED[_NUMBER[topic]].fields[:1]:
+        return values
+    return (values[0] + later_us, *values[1:])
 
 
 def samples(flight: RecordedFlight) -> Iterator[Sample]:

@@ -68,7 +68,7 @@ function makeTracks(goTo) {
         line(numbers(flight.errors.velocity_m_s), "m/s", COLOURS.other, { dash: "dash" }),
       ]]);
     }
-    list.push(["power without the computer [W]", [line(numbers(flight.power), "W", COLOURS.flown)]]);
+    if (flight.power) list.push(["power without the computer [W]", [line(numbers(flight.power), "W", COLOURS.flown)]]);
     if (flight.motors) {
       list.push(["motor outputs: front right, rear left; dotted: front left, rear right", ["front right", "rear left", "front left", "rear right"]
         .map((corner, i) => line(numbers(flight.motors[i]), corner, i % 2 ? COLOURS.other : COLOURS.flown, i < 2 ? { width: 1 } : { width: 1, dash: "dot" }))]);
