@@ -1,11 +1,11 @@
 """Rewards of a decision, for n vehicles at a time.
 
 `shaped` is the default. `timed` is for decisions of unequal length, as latencies that vary make
-them: it charges the time, not the decision, and a failure three times as much. `paper` is the
-paper's equation 2 to the letter: it does not train, its terms being a thousand times too large for
-any learner with a usual scale. `paper-scaled` is the same divided by 1000. Any other is the user's:
-a function of a `Step`, or a class, made without arguments, whose object is one. `costs` are taken
-off any of them.
+them: it charges the time, not the decision, and a failure three times as much. `progress` is for
+policies that decide with every image: progress is most of it. `paper` is the paper's equation 2 to
+the letter: it does not train, its terms being a thousand times too large for any learner with a
+usual scale. `paper-scaled` is the same divided by 1000. Any other is the user's: a function of a
+`Step`, or a class, made without arguments, whose object is one. `costs` are taken off any of them.
 """
 
 from __future__ import annotations
