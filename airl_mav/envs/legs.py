@@ -13,15 +13,14 @@ from numpy.typing import NDArray
 
 from airl_mav.core.kernels import kernel
 from airl_mav.envs.fleet import Fleet
-from airl_mav.envs.lanes import ATTITUDE, BY_RATES, POSITION, YAW_RATE, State
+from airl_mav.envs.lanes import ATTITUDE, POSITION, YAW_RATE, State
 
 
 class Legs(NamedTuple):
     """A flight of n vehicles in three legs, with what happens between them."""
 
     ticks: NDArray[np.int64]  # (n, 3) how long each one is
-    setpoint: NDArray[np.float64]  # (n, 4) taken at the end of the first, as `Fleet.setpoint`
-    by_rates: NDArray[np.bool_]  # (n,) as `Fleet.by_rates`
+    setpoint: NDArray[np.float64]  # (n, 4) velocities taken at the end of the first
     # Kept at the end of the second, or where the flight ends before it:
     seen_us: NDArray[np.int64]  # (n,) the time
     seen_position: NDArray[np.float64]  # (n, 3) NED [m]
@@ -45,9 +44,7 @@ def next_leg(
         if leg == 0:
             for axis in range(4):
                 fleet.setpoint[i, axis] = legs.setpoint[i, axis]
-            fleet.by_rates[i] = legs.by_rates[i]
-            state[YAW_RATE, j], state[BY_RATES, j] = fleet.setpoint[i, 3], fleet.by_rates[i]
-            fleet.repeat_us[i] = fleet.time_us[i]
+            state[YAW_RATE, j], fleet.repeat_us[i] = fleet.setpoint[i, 3], fleet.time_us[i]
         else:
             legs.seen_us[i] = fleet.time_us[i]
             for axis in range(3):

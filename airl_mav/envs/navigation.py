@@ -42,22 +42,17 @@ from airl_mav.envs.fleet import (
 )
 from airl_mav.envs.flight import advance
 from airl_mav.envs.legs import Legs
+from airl_mav.envs.rate_setpoints import RateSetpoints
 from airl_mav.envs.saved_state import State, Stateful
 from airl_mav.envs.sight import check_conditions, sight_of
 from airl_mav.envs.spec import EnvironmentSpec
-from airl_mav.envs.timing import (
-    RATES_FOLLOWED_US,
-    PipelinedTiming,
-    SequentialTiming,
-    give,
-    ticks_of,
-)
+from airl_mav.envs.timing import PipelinedTiming, SequentialTiming, give, ticks_of
 from airl_mav.envs.trace import Trace
 from airl_mav.envs.winds import Winds
 from airl_mav.faults.model import Fault
 from airl_mav.faults.twin import check_twin
 from airl_mav.latency.injection import Injection
-from airl_mav.policy.actions import vertical_speeds
+from airl_mav.policy.actions import UPRIGHT_S, vertical_speeds
 from airl_mav.policy.layouts import encode_layout
 from airl_mav.policy.observation import Kinematics, Observation, Rows, observe
 from airl_mav.policy.observation_spec import Encoded, ObservationSpec
@@ -209,7 +204,8 @@ class Navigation(Stateful):
         check_conditions(sight, spec, faults)
         table = self.vehicle.estimation if randomisation.estimation else None
         self._telemetry = Telemetry(n, table, randomisation.navigation_noise)
-        check_twin(faults, pipelined=spec.decisions == "pipelined")
+        pipelined = spec.decisions == "pipelined"
+        check_twin(faults, pipelined=pipelined)
         self._winds = Winds(n, spec.wind, faults)
         self.cameras = Cameras(
             n,
@@ -223,11 +219,16 @@ class Navigation(Stateful):
         )
         self._uplink = twin_faults(faults, "uplink")
         self._timing: SequentialTiming | PipelinedTiming
-        if spec.decisions == "pipelined":
-            self._timing = PipelinedTiming(n, self._link_us)
+        rates = None
+        if self.by_rates:
+            held_s = 0.0 if pipelined else rules.hold_s
+            timeout_s = rules.decision_timeout_s or held_s + UPRIGHT_S
+            rates = RateSetpoints(n, round(timeout_s * US_PER_S))
+        if pipelined:
+            self._timing = PipelinedTiming(n, self._link_us, rates)
         else:
             self._timing = SequentialTiming(
-                self.cameras, self._link_us, self._hold_us, self._hover_us, self._uplink
+                self.cameras, self._link_us, self._hold_us, self._hover_us, self._uplink, rates
             )
         if compensator is None and spec.compensate:
             compensator = Compensator(n, self.vehicle, self.intrinsics)
@@ -425,7 +426,7 @@ class Navigation(Stateful):
         # What a checkpoint of an environment without them does not have.
         if not self._winds.calm:
             held["winds"] = self._winds
-        if isinstance(self._timing, PipelinedTiming):
+        if self.by_rates or isinstance(self._timing, PipelinedTiming):
             held["timing"] = self._timing
         held |= self._companions.held()
         return held
@@ -465,15 +466,10 @@ class Navigation(Stateful):
             return False
         fleet = self.fleet
         # Those that do not fly take both where they are.
-        give(fleet, setpoints, fleet.verdict != Verdict.FLYING, by_rates=self.by_rates)
-        by_rates = np.full(self.n, self.by_rates)
-        if self.by_rates:
-            by_rates &= fleet.time_us + TICK_US * ticks[:, 0] >= RATES_FOLLOWED_US
-            setpoints = np.where(by_rates[:, None], setpoints, 0.0)
+        give(fleet, setpoints, fleet.verdict != Verdict.FLYING)
         legs = Legs(
             ticks,
             setpoints,
-            by_rates,
             fleet.time_us.copy(),
             fleet.position.copy(),
             fleet.quaternion.copy(),

@@ -2,10 +2,11 @@
 
 `shaped` is the default. `timed` is for decisions of unequal length, as latencies that vary make
 them: it charges the time, not the decision, and a failure three times as much. `progress` is for
-policies that decide with every image: progress is most of it. `paper` is the paper's equation 2 to
-the letter: it does not train, its terms being a thousand times too large for any learner with a
-usual scale. `paper-scaled` is the same divided by 1000. Any other is the user's: a function of a
-`Step`, or a class, made without arguments, whose object is one. `costs` are taken off any of them.
+policies that decide with every image: progress is most of it; `paced` the same without haste.
+`paper` is the paper's equation 2 to the letter: it does not train, its terms being a thousand times
+too large for any learner with a usual scale. `paper-scaled` is the same divided by 1000. Any other
+is the user's: a function of a `Step`, or a class, made without arguments, whose object is one.
+`costs` are taken off any of them.
 """
 
 from __future__ import annotations
@@ -42,6 +43,9 @@ AGILE_BONUS = 4.0
 
 AGILE_1_M, AGILE_1_S, AGILE_TURN = 0.3, 0.1, 0.002
 """`progress`: per metre of progress, per second, and per (rad/s)² that a decision commands."""
+
+PACE_M_S, PACE_SPREAD_M_S = 4.0, 12.0
+"""`paced`: progress beyond that speed is worth nothing, and up to it the less the faster."""
 
 PAPER_BONUS = 1000.0
 
@@ -105,12 +109,23 @@ def progress(step: Step) -> NDArray[np.float64]:
     Learning, IROS 2021, eq. 3). Of other actions the yaw rate is what turns.
     """
     passed_s = step.now.time_s - step.before.time_s
-    by_rates = step.commands.shape[1] == len(BodyRates._fields)
-    rates = step.commands[:, :3] if by_rates else step.commands[:, 2:]
-    turned = np.square(rates).sum(axis=1)
-    ended = AGILE_BONUS * _ended(step)
+    ended = AGILE_BONUS * _ended(step) - AGILE_TURN * _turned(step)
+    found: NDArray[np.float64] = ended + AGILE_1_M * step.progress_m - AGILE_1_S * passed_s
+    return found
+
+
+def paced(step: Step) -> NDArray[np.float64]:
+    """Return as `progress`, but for no haste: for policies that must see obstacles in time.
+
+    Time costs nothing, progress is paid up to 4 m/s, and the less of it the faster the vehicle
+    flies, none from 16 m/s on. Where haste pays, full thrust is learnt first: then nothing is seen
+    but the ground, and no gradient leads back from beyond the range of an action.
+    """
+    passed_s = step.now.time_s - step.before.time_s
+    worth = np.clip(1.0 - (step.now.speed_m_s - PACE_M_S) / PACE_SPREAD_M_S, 0.0, 1.0)
+    nearer_m = np.minimum(step.progress_m, PACE_M_S * passed_s) * worth
     found: NDArray[np.float64] = (
-        ended + AGILE_1_M * step.progress_m - AGILE_1_S * passed_s - AGILE_TURN * turned
+        AGILE_BONUS * _ended(step) + AGILE_1_M * nearer_m - AGILE_TURN * _turned(step)
     )
     return found
 
@@ -136,6 +151,14 @@ def paper_scaled(step: Step) -> NDArray[np.float64]:
     return paper(step) / PAPER_BONUS
 
 
+def _turned(step: Step) -> NDArray[np.float64]:
+    """Return the squares (n,) of the rates that are commanded [rad²/s²]."""
+    by_rates = step.commands.shape[1] == len(BodyRates._fields)
+    rates = step.commands[:, :3] if by_rates else step.commands[:, 2:]
+    squares: NDArray[np.float64] = np.square(rates).sum(axis=1)
+    return squares
+
+
 def _ended(step: Step) -> NDArray[np.float64]:
     return step.success.astype(np.float64) - step.failure
 
@@ -144,6 +167,7 @@ SHIPPED: dict[str, Reward] = {
     "shaped": shaped,
     "timed": timed,
     "progress": progress,
+    "paced": paced,
     "paper-scaled": paper_scaled,
     "paper": paper,
 }

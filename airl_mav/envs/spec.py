@@ -22,7 +22,7 @@ from airl_mav.policy.action_sets import (
     ActionSpec,
     MaxRate,
 )
-from airl_mav.policy.actions import DecisionTiming
+from airl_mav.policy.actions import UPRIGHT_S, DecisionTiming
 from airl_mav.policy.observation_spec import (
     LEAST_ROWS,
     STRIP_ROWS,
@@ -39,7 +39,7 @@ from airl_mav.profiles.distortion import check_distortion
 from airl_mav.profiles.projection import CYLINDER_MOST_DEG, Projection, check_fov
 from airl_mav.profiles.vehicle import load_vehicle
 
-SHIPPED_REWARDS = ("shaped", "timed", "progress", "paper-scaled", "paper")
+SHIPPED_REWARDS = ("shaped", "timed", "progress", "paced", "paper-scaled", "paper")
 """See `envs.rewards`."""
 
 RewardName = Annotated[str, part_name(REWARDS, SHIPPED_REWARDS)]
@@ -68,6 +68,16 @@ class EpisodeRules(ProfileModel):
         ge=0,
         le=60,
         default=None,
+    )
+    decision_timeout_s: float | None = quantity(
+        "time since the last action after which body rates are replaced by a stop, as the"
+        f" companion's watchdog does; left out: {UPRIGHT_S:g} beyond the hold time. Velocities"
+        " persist",
+        "s",
+        ge=0.1,
+        le=60,
+        default=None,
+        later=True,
     )
     altitude_m: float = quantity(
         "height that is held; with a vertical speed in the actions: that it begins at",
@@ -301,7 +311,7 @@ class EnvironmentSpec(ProfileModel):
     max_rate_deg_s: MaxRate = later_field(MAX_RATE_DEG_S)
     reward: RewardName = Field(
         default="shaped",
-        description="reward: shaped, timed, progress, paper-scaled, paper, or your own as"
+        description="reward: shaped, timed, progress, paced, paper-scaled, paper, or your own as"
         " MODULE:NAME or FILE.py:NAME",
     )
     costs: Costs = Field(
@@ -350,6 +360,16 @@ class EnvironmentSpec(ProfileModel):
             raise ValueError(
                 "decisions = 'pipelined': with episode.hover_after_s: accepted: one of them, as no"
                 " hold ends"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _waits_for_its_hold(self) -> EnvironmentSpec:
+        timeout_s, held_s = self.episode.decision_timeout_s, self.episode.hold_s
+        if self.decisions == "sequential" and timeout_s is not None and timeout_s <= held_s:
+            raise ValueError(
+                f"episode.decision_timeout_s = {timeout_s:g}: accepted: value > {held_s:g} s"
+                " (episode.hold_s), or every decision is overdue"
             )
         return self
 

@@ -12,21 +12,19 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.control.demand import KIND_US
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.envs.cameras import Cameras
 from airl_mav.envs.faults import TwinFault, later_us
 from airl_mav.envs.fleet import Fleet
+from airl_mav.envs.rate_setpoints import RateSetpoints
 from airl_mav.envs.saved_state import Stateful
 
 Times = NDArray[np.int64]
 """(n,) [µs], or in ticks."""
 
-RATES_FOLLOWED_US = KIND_US - 100_000
-"""Body rates are followed so long after a flight has begun: until then the flight controller flies
-the velocity with which the companion has switched to offboard, a tenth of a second before
-(`companion.mavsdk_link.OFFBOARD_SETTLE_S`) [µs]."""
+_NEVER_US = 10**12
+"""Later than any flight ends [µs]."""
 
 
 class Vehicles(Protocol):
@@ -35,11 +33,6 @@ class Vehicles(Protocol):
     @property
     def fleet(self) -> Fleet:
         """Their state."""
-        ...
-
-    @property
-    def by_rates(self) -> bool:
-        """Whether their setpoints are body rates and thrusts, and not velocities."""
         ...
 
     @property
@@ -85,7 +78,7 @@ class Timing(Protocol):
             vehicles: What flies.
             setpoints: (n, 4) forward, right, down [m/s], yaw rate [rad/s]; the third, where it is
                 NaN, is written when it is sent: it then holds the altitude. Or body rates and
-                thrusts, see `Vehicles.by_rates`.
+                thrusts (`RateSetpoints`).
             t2_us: (n,) time of the inference.
 
         Returns:
@@ -104,6 +97,7 @@ class SequentialTiming(Stateful):
         hold_us: int,
         hover_us: int | None,
         uplink: Sequence[TwinFault] = (),
+        rates: RateSetpoints | None = None,
     ) -> None:
         """Take the times.
 
@@ -114,12 +108,13 @@ class SequentialTiming(Stateful):
             hover_us: The velocity is zeroed so long after the hold when no new action has come;
                 None: the last one persists [µs].
             uplink: Faults by which setpoints arrive later.
+            rates: Where body rates are commanded; None: velocities are.
 
         Raises:
             UsageError: The hold is so short that a decision would have to wait for its frame.
         """
         self._link_us, self._hold_us, self._hover_us = link_us, hold_us, hover_us
-        self._uplink = uplink
+        self._uplink, self._rates = uplink, rates
         late_us = round(sum(each.fault.amount for each in uplink) * US_PER_S)
         least_us = link_us + late_us + cameras.latest_us + cameras.period_us
         if hold_us < least_us:
@@ -130,7 +125,9 @@ class SequentialTiming(Stateful):
             )
 
     def begin(self, i: int) -> None:
-        """Do nothing: all that was sent has been taken when a decision begins."""
+        """Begin the flight of vehicle i: nothing is in flight when a decision begins."""
+        if self._rates is not None:
+            self._rates.begin(i)
 
     def fly(self, vehicles: Vehicles, setpoints: NDArray[np.float64], t2_us: Times) -> Times:
         """Fly one decision of every vehicle; see `Timing`."""
@@ -140,7 +137,9 @@ class SequentialTiming(Stateful):
         if self._uplink:
             arrives_us += later_us(self._uplink, fleet.time_us + t2_us)
         sent, accepted = ticks_of(t2_us), ticks_of(arrives_us)
-        stop = self._stop(fleet.time_us)
+        stop = self._stop(fleet.time_us, sent)
+        if self._rates is not None:
+            self._rates.sent(fleet.time_us + TICK_US * sent)
         self._wait(vehicles, np.zeros_like(sent), sent, stop)
         _hold_altitude(vehicles, setpoints, np.ones(len(sent), np.bool_))
         left, link = sent + self._hold_us // TICK_US - accepted, accepted - sent
@@ -155,11 +154,11 @@ class SequentialTiming(Stateful):
         else:
             self._wait(vehicles, sent, accepted, stop)
             everyone = np.ones(len(sent), np.bool_)
-            give(fleet, setpoints, everyone, by_rates=vehicles.by_rates)
+            give(fleet, setpoints, everyone, self._rates)
             age = self._age(vehicles, fleet.time_us, left)
-            vehicles.advance(left - age)
+            advance(vehicles, left - age, self._rates)
             vehicles.capture(fleet.verdict >= 0)
-            vehicles.advance(age)
+            advance(vehicles, age, self._rates)
         aged: Times = TICK_US * age
         return aged
 
@@ -167,31 +166,44 @@ class SequentialTiming(Stateful):
         """Return the age (n,) of the newest frames `left` ticks after a time, `left` at most."""
         return np.minimum(ticks_of(vehicles.cameras.age_us(now_us + left * TICK_US)), left)
 
-    def _stop(self, began_us: Times) -> Times | None:
-        """Return the ticks (n,) after which the last setpoint expires; None: it never does."""
-        if self._hover_us is None:
+    def _stop(self, began_us: Times, sent: Times) -> Times | None:
+        """Return the ticks (n,) after which the last setpoint expires; None: it never does.
+
+        That is a while after its hold, or, of body rates, when the next decision is overdue, which
+        is sent so many ticks (n,) from now.
+        """
+        stop_us: Times | None = None
+        if self._hover_us is not None:
+            stop_us = np.full(len(began_us), self._hover_us, np.int64)
+        if self._rates is not None:
+            overdue = self._rates.overdue(began_us)
+            # What is replaced in time never expires, though the next is on its way.
+            overdue_us = np.where(overdue < sent, overdue * TICK_US, _NEVER_US)
+            stop_us = overdue_us if stop_us is None else np.minimum(stop_us, overdue_us)
+        if stop_us is None:
             return None
         # The stop takes as long to arrive as any setpoint.
-        stop_us = np.full(len(began_us), self._hover_us + self._link_us)
-        if self._uplink:
-            stop_us += later_us(self._uplink, began_us + self._hover_us)
-        return ticks_of(stop_us)
+        late_us = later_us(self._uplink, began_us + stop_us) if self._uplink else 0
+        return ticks_of(stop_us + self._link_us + late_us)
 
     def _wait(self, vehicles: Vehicles, start: Times, end: Times, stop: Times | None) -> None:
         """Fly on the last setpoint from one tick to another; it may expire in between."""
         if stop is None:
-            vehicles.advance(end - start)
+            advance(vehicles, end - start, self._rates)
             return
         fleet = vehicles.fleet
         reached = np.clip(stop, start, end)
-        vehicles.advance(reached - start)
+        advance(vehicles, reached - start, self._rates)
         over = (stop >= start) & (stop < end)
-        fleet.setpoint[over], fleet.by_rates[over] = 0.0, False
-        fleet.repeat_us[over] = fleet.time_us[over]
-        vehicles.advance(end - reached)
+        if self._rates is not None:
+            self._rates.stop(fleet, over)
+        else:
+            fleet.setpoint[over] = 0.0
+            fleet.repeat_us[over] = fleet.time_us[over]
+        advance(vehicles, end - reached, self._rates)
 
     def _held(self) -> Mapping[str, Any]:
-        return {}
+        return {} if self._rates is None else {"rates": self._rates}
 
 
 class PipelinedTiming(Stateful):
@@ -202,9 +214,15 @@ class PipelinedTiming(Stateful):
     begins: it is too new by the time of its transport at most.
     """
 
-    def __init__(self, n: int, link_us: int) -> None:
-        """Prepare n vehicles; `link_us` is the time from a setpoint sent to accepted [µs]."""
-        self._link_us = link_us
+    def __init__(self, n: int, link_us: int, rates: RateSetpoints | None = None) -> None:
+        """Prepare n vehicles.
+
+        Args:
+            n: How many.
+            link_us: Time from a setpoint sent to accepted [µs].
+            rates: Where body rates are commanded; None: velocities are.
+        """
+        self._link_us, self._rates = link_us, rates
         # A decision lasts a tick at least.
         room = max(-(-link_us // TICK_US), 1)
         self._left = np.zeros((n, room), np.int64)
@@ -214,6 +232,8 @@ class PipelinedTiming(Stateful):
     def begin(self, i: int) -> None:
         """Begin the flight of vehicle i: nothing is in flight."""
         self._left[i] = 0
+        if self._rates is not None:
+            self._rates.begin(i)
 
     def fly(self, vehicles: Vehicles, setpoints: NDArray[np.float64], t2_us: Times) -> Times:
         """Fly one decision of every vehicle; see `Timing`."""
@@ -228,23 +248,28 @@ class PipelinedTiming(Stateful):
         room = self._left.shape[1]
         # The oldest in flight is the first to arrive.
         due = np.column_stack([self._left[:, ::-1], ended - age, sent, accepted])
+        if self._rates is not None:
+            due = np.column_stack([due, *self._stops(self._rates.overdue(began_us), sent, ended)])
+            self._rates.sent(began_us + TICK_US * sent)
         happens = due <= ended[:, None]
         happens[:, :room] &= due[:, :room] > 0
         due = np.minimum(due, ended[:, None])
         each = np.arange(len(due))
         for event in np.argsort(due, axis=1, kind="stable").T:
-            vehicles.advance(due[each, event] - now)
+            advance(vehicles, due[each, event] - now, self._rates)
             now, real = due[each, event], happens[each, event]
             for k in range(room):
                 in_flight, arrived = self._in_flight[:, room - 1 - k], (event == k) & real
-                give(fleet, in_flight, arrived, by_rates=vehicles.by_rates)
+                give(fleet, in_flight, arrived, self._rates)
             captured, decided = event == room, event == room + 1
             if captured.any():
                 vehicles.capture(captured)
             if decided.any():
                 _hold_altitude(vehicles, setpoints, decided)
-            give(fleet, setpoints, (event == room + 2) & real, by_rates=vehicles.by_rates)
-        vehicles.advance(ended - now)
+            give(fleet, setpoints, (event == room + 2) & real, self._rates)
+            if self._rates is not None:
+                self._rates.stop(fleet, (event > room + 2) & real)
+        advance(vehicles, ended - now, self._rates)
         self._left[:, 1:] = np.maximum(self._left[:, :-1] - ended[:, None], 0)
         self._in_flight[:, 1:] = self._in_flight[:, :-1]
         self._left[:, 0] = np.maximum(accepted - ended, 0)
@@ -252,8 +277,25 @@ class PipelinedTiming(Stateful):
         aged: Times = TICK_US * age
         return aged
 
+    def _stops(self, overdue: Times, sent: Times, ended: Times) -> tuple[Times, Times]:
+        """Return the ticks (n,) at which stops arrive, before the setpoint and behind it.
+
+        What does not happen in this decision comes after its end. A stop takes as long as any
+        setpoint, but is there before the next, and by the end of the decision.
+        """
+        if self._rates is None:
+            raise ValueError("velocities are not replaced by a stop")
+        link, never = self._link_us // TICK_US, ended + 1
+        again = sent + self._rates.timeout
+        before, behind = (np.minimum(at + link, ended) for at in (overdue, again))
+        return (
+            np.where((overdue >= 0) & (overdue < sent), before, never),
+            np.where(again < ended, behind, never),
+        )
+
     def _held(self) -> Mapping[str, Any]:
-        return {"left": self._left, "in_flight": self._in_flight}
+        held: dict[str, Any] = {"left": self._left, "in_flight": self._in_flight}
+        return held if self._rates is None else {**held, "rates": self._rates}
 
 
 def _hold_altitude(
@@ -266,16 +308,28 @@ def _hold_altitude(
 
 
 def give(
-    fleet: Fleet, setpoints: NDArray[np.float64], who: NDArray[np.bool_], *, by_rates: bool
+    fleet: Fleet,
+    setpoints: NDArray[np.float64],
+    who: NDArray[np.bool_],
+    rates: RateSetpoints | None = None,
 ) -> None:
-    """Give the vehicles in `who` (n,) their setpoints (n, 4); they take them at once.
+    """Give the vehicles in `who` (n,) their setpoints (n, 4), velocities or `rates`.
 
-    Those are body rates and thrusts if `by_rates`, which nobody follows yet who has just begun.
+    Velocities are flown at once.
     """
-    if by_rates:
-        who = who & (fleet.time_us >= RATES_FOLLOWED_US)
-    fleet.setpoint[who], fleet.by_rates[who] = setpoints[who], by_rates
+    if rates is not None:
+        rates.take(fleet, setpoints, who)
+        return
+    fleet.setpoint[who] = setpoints[who]
     fleet.repeat_us[who] = fleet.time_us[who]
+
+
+def advance(vehicles: Vehicles, ticks: Times, rates: RateSetpoints | None) -> None:
+    """Fly each vehicle for so many ticks (n,), by velocities or `rates`."""
+    if rates is not None:
+        rates.advance(vehicles, ticks)
+    else:
+        vehicles.advance(ticks)
 
 
 def ticks_of(time_us: Times) -> Times:

@@ -67,6 +67,8 @@ def environment_of(scenario: ResolvedScenario) -> EnvironmentSpec:
             },
         }
     pilot = scenario.pilot
+    # Velocities persist in the twin.
+    by_rates = pilot.commands == "body_rates"
     return spec_of(
         None,
         {
@@ -78,6 +80,9 @@ def environment_of(scenario: ResolvedScenario) -> EnvironmentSpec:
                 "time_limit_s": asked.time_limit_s,
                 "hold_s": pilot.hold_s,
                 "hover_after_s": scenario.watchdog.hover_after_s,
+                **(
+                    {"decision_timeout_s": scenario.watchdog.decision_timeout_s} if by_rates else {}
+                ),
                 "altitude_m": pilot.altitude_m,
             },
             "delay": {

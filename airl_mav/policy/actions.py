@@ -65,6 +65,10 @@ KINDS: dict[CommandKind, type[Any]] = {
     "body_rates": BodyRates,
 }
 
+UPRIGHT_S = 0.15
+"""An attitude, or body rates, persist so long by default, beyond the hold time, before the flight
+controller is to hold the vehicle instead [s]: at 3 rad/s it has turned by 26 degrees."""
+
 ALTITUDE_P = 0.5
 """Vertical speed per metre of altitude error [1/s]: slow enough for decisions 1.5 s apart."""
 

@@ -167,6 +167,15 @@ class PolicyFacts(ProfileModel):
         le=60,
         default=None,
     )
+    decision_timeout_s: float | None = quantity(
+        "a decision is overdue so long after the last one; none: as the companion has it by"
+        " default",
+        "s",
+        ge=0.1,
+        le=60,
+        default=None,
+        later=True,
+    )
     decisions: DecisionTiming = Field(
         default="sequential", description="when a decision begins; see airl_mav.scenario.model"
     )

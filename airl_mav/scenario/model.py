@@ -14,7 +14,7 @@ from pydantic import Field, ModelWrapValidatorHandler, ValidationError, model_va
 from airl_mav.core.constants import CommandKind
 from airl_mav.core.fields import ProfileModel, field_error, quantity
 from airl_mav.flight.judge import TIME_LIMIT_S, GoalRadius, TimeLimit
-from airl_mav.policy.actions import DecisionTiming
+from airl_mav.policy.actions import UPRIGHT_S, DecisionTiming
 from airl_mav.scenario.aircraft import FREE, NO_TWIN, Aircraft
 
 Place = tuple[
@@ -54,18 +54,14 @@ def _seed(description: str, default: Any = 1) -> Any:
 DECISION_TIMEOUT_S = 2.0
 """A velocity persists so long by default when no other comes [s]."""
 
-UPRIGHT_S = 0.15
-"""An attitude, or body rates, persist so long by default, beyond the hold time, before the flight
-controller is to hold the vehicle instead [s]: at 3 rad/s it has turned by 26 degrees."""
-
 
 class WatchdogSettings(ProfileModel):
     """Bounds on the silence of the policy, in simulated time."""
 
     decision_timeout_s: float | None = quantity(
         "time since the last action after which the velocity is zeroed; longer than the hold time;"
-        f" by default {DECISION_TIMEOUT_S:g}, and {UPRIGHT_S:g} beyond the hold time for a policy"
-        " that commands attitudes or body rates",
+        f" by default as the policy's card says, or {DECISION_TIMEOUT_S:g}, and {UPRIGHT_S:g}"
+        " beyond the hold time for a policy that commands attitudes or body rates",
         "s",
         ge=0.1,
         le=60,
@@ -88,15 +84,23 @@ class WatchdogSettings(ProfileModel):
         default=None,
     )
 
-    def timeout_s(self, commands: CommandKind = "velocity", hold_s: float = 0.0) -> float:
-        """Return the time-out of a decision [s]: as asked for, or by default.
+    def timeout_s(
+        self,
+        commands: CommandKind = "velocity",
+        hold_s: float = 0.0,
+        on_card: float | None = None,
+    ) -> float:
+        """Return the time-out of a decision [s]: as asked for, as on the card, or by default.
 
         Args:
             commands: What the policy commands.
             hold_s: How long each of its actions is held [s].
+            on_card: What the policy's card says [s]; None: nothing.
         """
         if self.decision_timeout_s is not None:
             return self.decision_timeout_s
+        if on_card is not None:
+            return on_card
         return DECISION_TIMEOUT_S if commands == "velocity" else hold_s + UPRIGHT_S
 
 

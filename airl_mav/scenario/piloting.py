@@ -70,7 +70,8 @@ def decide_piloting(
             "decisions", pilot.decisions, "without watchdog.hover_after_s, as no hold ends"
         )
     held_s = pilot.hold_s if pilot.decisions == "sequential" else 0.0
-    timeout_s = asked.watchdog.timeout_s(pilot.commands, held_s)
+    on_card = None if card is None else card.decision_timeout_s
+    timeout_s = asked.watchdog.timeout_s(pilot.commands, held_s, on_card)
     if timeout_s <= held_s:
         raise FieldError(
             "watchdog.decision_timeout_s",

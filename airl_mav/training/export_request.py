@@ -27,7 +27,7 @@ from airl_mav.profiles.projection import Projection
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.model import PilotSettings
 
-FLOWN = ("hold_s", "goal_radius_m", "altitude_m", "hover_after_s")
+FLOWN = ("hold_s", "goal_radius_m", "altitude_m", "hover_after_s", "decision_timeout_s")
 """How a policy is flown: fields of the request, of a card and of an environment's episodes."""
 
 SEEN = (
@@ -55,6 +55,7 @@ DEFAULTS: dict[str, Any] = {
     "goal_radius_m": GOAL_RADIUS_M,
     "altitude_m": PilotSettings.altitude_m,
     "hover_after_s": None,
+    "decision_timeout_s": None,
     "decisions": PilotSettings.decisions,
     "compensate": PilotSettings.compensate,
 }
@@ -167,6 +168,11 @@ class ExportRequest(BaseModel):
         default=None,
         description="age of a command at which the vehicle hovered in training, s; by default the"
         " last one flew on",
+    )
+    decision_timeout_s: float | None = Field(
+        default=None,
+        description="time since the last action after which a decision was overdue in training, s;"
+        " by default as the companion has it",
     )
     decisions: DecisionTiming | None = Field(
         default=None,

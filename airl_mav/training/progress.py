@@ -8,6 +8,9 @@ from typing import ClassVar
 from airl_mav.core.progress import Event, Progress
 from airl_mav.training.store import Evaluation, TrainingProgress
 
+FLOWN_BY_CHANCE = 0.2
+"""So much more of success in training than on the selection's episodes is told."""
+
 
 @dataclass(frozen=True)
 class Evaluated(Event):
@@ -70,7 +73,19 @@ class TrainingBar(TrainingProgress):
         )
         time = "" if evaluation.flight_time_s is None else f"{evaluation.flight_time_s:6.2f} s"
         zone = "" if evaluation.zone is None else f"  zone {evaluation.zone}"
+        zone += _of_training(evaluation)
         self._progress.note(
             f"{evaluation.steps:>11,} decisions {evaluation.seconds:7.0f} s  success "
             f"{evaluation.success_rate:6.1%}  {time}{zone}{'  best so far' if best else ''}"
         )
+
+
+def _of_training(evaluation: Evaluation) -> str:
+    """Tell the success in training, whose actions are random in part, where it is another matter.
+
+    Who flies well by chance alone does not when the likeliest action is taken each time.
+    """
+    success = evaluation.training_success
+    if success is None or success - evaluation.success_rate < FLOWN_BY_CHANCE:
+        return ""
+    return f"  ({success:.1%} with training's random actions)"

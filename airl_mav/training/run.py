@@ -373,6 +373,7 @@ def facts_of(config: TrainingConfig, name: str, command: str, steps: int) -> Pol
         goal_radius_m=environment.episode.goal_radius_m,
         altitude_m=environment.episode.altitude_m,
         hover_after_s=environment.episode.hover_after_s,
+        decision_timeout_s=environment.episode.decision_timeout_s,
         decisions=environment.decisions,
         compensate=environment.compensate,
         algorithm=config.algorithm.name,

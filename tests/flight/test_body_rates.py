@@ -158,6 +158,35 @@ def test_overdue_body_rates_are_replaced_by_a_stand(tmp_path: Path, seed: int) -
     assert math.degrees(max(tilts)) < 60.0
 
 
+@pytest.mark.parametrize(
+    ("latency", "asked", "close"),
+    [
+        # Each decision is overdue: replaced, and followed again where PX4's control mode has it.
+        ("230ms", {}, 0.12),
+        # Stalls are survived at both.
+        ("stalls", {}, 0.08),
+        ("stalls", {"decisions": "sequential", "hold_s": 0.07}, 0.15),
+    ],
+)
+def test_overdue_decisions_cost_the_twin_what_they_cost_the_companion(
+    tmp_path: Path, latency: str, asked: dict[str, Any], close: float
+) -> None:
+    stalls = tmp_path / "stalls.txt"
+    stalls.write_text("5\n" * 30 + "1000\n")
+    flights = {}
+    for level in ("gym", "lockstep"):
+        known = {"policy": POLICY, "arena": "no-obstacles", "level": level, "episodes": 4} | asked
+        known["latency"] = str(stalls) if latency == "stalls" else latency
+        rehearse(Scenario(**known), out=tmp_path / level)
+        run = load(tmp_path / level)
+        flights[level] = run.episodes
+    ends = [each.outcome for each in flights["gym"]]
+    assert [each.outcome for each in flights["lockstep"]] == ends
+    assert set(ends) == {Outcome.COLLISION if latency == "230ms" else Outcome.SUCCESS}
+    mean = [times(each)[:, 0].mean() for each in flights.values()]
+    assert mean[0] == pytest.approx(mean[1], rel=close)
+
+
 def test_an_attitude_is_flown_and_told_as_such() -> None:
     leaning = flown(f"{__name__}:Leaning")
     assert leaning.record.outcome is Outcome.SUCCESS

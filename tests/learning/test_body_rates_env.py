@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -12,14 +13,14 @@ from gymnasium.utils.env_checker import check_env
 
 import airl_mav.envs  # noqa: F401 (registers the environments)
 from airl_mav.control.demand import KIND_US
-from airl_mav.core.constants import US_PER_S
+from airl_mav.core.constants import TICK_US, US_PER_MS, US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import quats_to_euler
-from airl_mav.envs.fleet import Verdict
+from airl_mav.envs.fleet import Verdict, new_fleet
 from airl_mav.envs.navigation import Navigation
-from airl_mav.envs.rewards import Step, progress
+from airl_mav.envs.rate_setpoints import RATES_FOLLOWED_US, RateSetpoints
+from airl_mav.envs.rewards import Step, paced, progress
 from airl_mav.envs.spec import EnvironmentSpec, spec_of
-from airl_mav.envs.timing import RATES_FOLLOWED_US
 from companion.mavsdk_link import OFFBOARD_SETTLE_S
 
 KNOBS: dict[str, Any] = {
@@ -81,6 +82,79 @@ def test_what_is_commanded_turns_as_commanded() -> None:
     np.testing.assert_allclose(omega, rates[:, :3], atol=0.08)
     assert navigation.fleet.velocity[3, 2] < -0.3, "more thrust climbs"
     assert navigation.fleet.by_rates.all()
+
+
+class Clockwork:
+    """Vehicles of which only the time goes on."""
+
+    def __init__(self, n: int) -> None:
+        self.fleet = new_fleet(n)
+
+    def advance(self, ticks: np.ndarray) -> None:
+        self.fleet.time_us[:] += TICK_US * ticks
+
+    def told(self, i: int = 0) -> tuple[float, bool, tuple[float, ...]]:
+        """Return the time [ms], and what vehicle i follows."""
+        fleet = self.fleet
+        return fleet.time_us[i] / US_PER_MS, bool(fleet.by_rates[i]), tuple(fleet.setpoint[i])
+
+
+def test_kinds_of_setpoints_are_followed_when_px4_publishes_its_control_mode() -> None:
+    vehicles, rates, everyone = Clockwork(2), RateSetpoints(2, 150_000), np.ones(2, np.bool_)
+    turn, end, stand = (0.1, 0.2, 0.3, 0.6), (0.0, 0.0, 0.0, 0.6), (0.0, 0.0, 0.0, 0.0)
+
+    def fly(until_ms: int) -> tuple[float, bool, tuple[float, ...]]:
+        until_us = until_ms * US_PER_MS
+        rates.advance(vehicles, (until_us - vehicles.fleet.time_us) // TICK_US)
+        return vehicles.told()
+
+    fly(100)
+    rates.take(vehicles.fleet, np.tile(turn, (2, 1)), everyone)
+    assert vehicles.told() == (100.0, False, stand)
+    # Not before the tick that begins then.
+    assert fly(400) == (400.0, False, stand)
+    assert fly(404) == (404.0, True, turn)
+    rates.stop(vehicles.fleet, np.array([True, False]))
+    assert vehicles.told() == (404.0, True, end)
+    assert vehicles.told(1) == (404.0, True, turn)
+    assert fly(904) == (904.0, False, stand)
+    assert vehicles.told(1) == (904.0, True, turn)
+    rates.take(vehicles.fleet, np.tile(turn, (2, 1)), everyone)
+    assert fly(1400) == (1400.0, False, stand)
+    # Two changes in one go, of which the first is the other's.
+    assert fly(3000) == (3000.0, True, turn)
+    assert vehicles.told(1) == (3000.0, True, turn)
+
+
+def stands(navigation: Navigation) -> list[bool]:
+    """Return who has come to stand after two seconds of hovering by body rates, one tilted."""
+    tilted = (0.6, 0.0, 0.0, 0.52)
+    for _ in range(22):
+        navigation.fly(np.tile(tilted, (navigation.n, 1)))
+    navigation._extra_us[:] = 1_200_000
+    navigation.fly(np.tile(tilted, (navigation.n, 1)))
+    return (tilts(navigation) < 0.1).tolist()
+
+
+def test_overdue_body_rates_are_replaced_by_a_stand() -> None:
+    """As the companion's watchdog does; unless it is told to wait longer."""
+    assert stands(begun(2)) == [True, True]
+    rules = {"decision_timeout_s": 3.0}
+    assert stands(begun(2, episode=rules)) == [False, False]
+
+
+def test_a_saved_stall_goes_on_as_it_was() -> None:
+    whole, first = begun(3), begun(3)
+    for navigation in (whole, first):
+        stands(navigation)
+    second = Navigation(spec(), 3)
+    second.set_state(first.get_state())
+    for navigation in (whole, second):
+        navigation._extra_us[:] = 40_000
+        for _ in range(20):
+            navigation.fly(np.tile((0.3, 0.1, 0.2, 0.55), (3, 1)))
+    np.testing.assert_array_equal(second.fleet.quaternion, whole.fleet.quaternion)
+    np.testing.assert_array_equal(second.fleet.by_rates, whole.fleet.by_rates)
 
 
 def test_an_expired_command_is_a_hover_by_velocity() -> None:
@@ -171,3 +245,15 @@ def test_the_reward_of_progress_by_hand() -> None:
     level = progress(Step(before, now, np.array([(3.0, 1.0, 2.0), (0, 0, 0)]), 0.5))
     np.testing.assert_allclose(level - found, [0.002 * (5.25 - 4.0), 0.0], atol=1e-12)
     assert math.isfinite(found.sum())
+
+
+def test_the_reward_without_haste_by_hand() -> None:
+    """Three vehicles as fast as 2, 8 and 20 m/s: 1, 2/3 and none of 4 m/s count."""
+    navigation, fast = begun(3), np.array([2.0, 8.0, 20.0])
+    before, commands = navigation.flights(), np.tile((0.0, 2.0, 0.0, 0.5), (3, 1))
+    now = replace(before, time_s=before.time_s + 0.1, speed_m_s=fast)
+    now = replace(now, goal_distance_m=before.goal_distance_m - 0.1 * fast)
+    found = paced(Step(before, now, commands, 0.5))
+    np.testing.assert_allclose(found, [0.3 * 0.2 - 0.008, 0.3 * 0.4 * 2 / 3 - 0.008, -0.008])
+    ended = replace(now, verdict=np.array([Verdict.SUCCESS, Verdict.COLLISION, now.verdict[2]]))
+    np.testing.assert_allclose(paced(Step(before, ended, commands, 0.5)) - found, [4.0, -4.0, 0.0])

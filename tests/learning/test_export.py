@@ -662,7 +662,11 @@ def test_a_module_of_one_s_own_flies_as_it_decides(
         ("nets.py:Net", ["--weights", "none.pt"], "--weights none.pt: no such file"),
         ("nets.py:Net", ["--weights", "nets.py"], "--weights nets.py: not the module's: "),
         ("nets.py:Net", ["--weights", "other.pt"], "not the module's: .*[Mm]issing key"),
-        ("nets.py:Net", ["--like", "nowhere"], "no training profile 'nowhere'; shipped: crowded"),
+        (
+            "nets.py:Net",
+            ["--like", "nowhere"],
+            "no training profile 'nowhere'; shipped: body-rates",
+        ),
         ("nets.py:Narrow", ["--actions", "velocity"], "outputs action .*accepted: action"),
         ("model.zip", [], "algorithm: accepted: the class that wrote the .zip"),
         ("model.zip", ["--algorithm", "PPO", "--weights", "o.pt"], "with a module of your own"),

@@ -216,8 +216,7 @@ def test_neither_order_nor_company_matters(arena: str) -> None:
 
 
 @pytest.mark.parametrize("arena", ["no-obstacles", "dynamic-obstacles"])
-@pytest.mark.parametrize("share", [0.0, 0.3])
-def test_legs_are_flights_one_after_the_other(arena: str, share: float) -> None:
+def test_legs_are_flights_one_after_the_other(arena: str) -> None:
     """With the setpoint between them, and the pose for the camera; also where a flight ends."""
     n = 5 * LANES + 2
     at_once, parts = (fleet_of(n, np.random.default_rng(2)) for _ in range(2))
@@ -226,17 +225,15 @@ def test_legs_are_flights_one_after_the_other(arena: str, share: float) -> None:
         setpoints = rng.uniform([0, -4, -0.3, -2], [8, 4, 0.3, 2], (n, 4))
         ticks = rng.integers([1, 0, 0], [12, 9, 9], (n, 3))
         flies = at_once.verdict == Verdict.FLYING
-        by_rates = rng.random(n) < share
-        setpoints[by_rates] = (0.2, -0.1, 0.3, 0.5) * setpoints[by_rates] + (0.0, 0.0, 0.0, 0.5)
         seen = np.zeros(n, np.int64), np.zeros((n, 3)), np.zeros((n, 4))
-        legs = Legs(ticks, setpoints, by_rates, *seen)
+        legs = Legs(ticks, setpoints, *seen)
         advance(at_once, arenas, ticks.sum(axis=1), VEHICLE, RULES, None, legs)
         for k in range(3):
             before = parts.verdict.copy()
             advance(parts, arenas, ticks[:, k].copy(), VEHICLE, RULES, None)
             ended[k] += (parts.verdict != before).sum()
             if k == 0:
-                parts.setpoint[flies], parts.by_rates[flies] = setpoints[flies], by_rates[flies]
+                parts.setpoint[flies] = setpoints[flies]
                 parts.repeat_us[flies] = parts.time_us[flies]
             elif k == 1:
                 for name in ("time_us", "position", "quaternion"):

@@ -17,6 +17,7 @@ import pytest
 from numpy.typing import NDArray
 
 from airl_mav.core.errors import UsageError
+from airl_mav.core.progress import Progress
 from airl_mav.envs.evaluation import fly_episodes, success_rate
 from airl_mav.policy.card import load_card
 from airl_mav.policy.learned import load_learned
@@ -26,9 +27,10 @@ from airl_mav.rehearsal import lock
 from airl_mav.rehearsal.run_folder import load
 from airl_mav.training import run
 from airl_mav.training.config import TrainingConfig, check_fields
+from airl_mav.training.progress import TrainingBar
 from airl_mav.training.request import TrainRequest
 from airl_mav.training.run import nominal
-from airl_mav.training.store import TrainingFolder
+from airl_mav.training.store import Evaluation, TrainingFolder
 from tests.support.command_line import airl, option_words
 from tests.support.flown_here import flown_here
 from tests.support.processes import ROOT, SITL_WITHOUT_REPORT, allow_interrupt, wait_until
@@ -186,6 +188,22 @@ def test_programs_read_lines(short: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.nightly
+@pytest.mark.parametrize(
+    ("in_training", "told"),
+    [(None, ""), (0.5, ""), (0.945, "  (94.5% with training's random actions)")],
+)
+def test_who_flies_well_by_chance_alone_is_told(in_training: float | None, told: str) -> None:
+    notes: list[str] = []
+
+    class Noted(Progress):
+        def note(self, text: str, style: str | None = None) -> None:
+            notes.append(text)
+
+    evaluation = Evaluation(5_000, 60.0, 300, 0.36, 0.64, 2.4, 15.0, in_training, None)
+    TrainingBar(Noted(), 10_000).evaluated(evaluation, best=False)
+    assert notes == [f"      5,000 decisions      60 s  success  36.0%    2.40 s{told}"]
+
+
 def test_folders_are_not_mixed_up(short: Path, straight: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="or resume"):
         airl("train", str(short), "--out", str(straight))
