@@ -84,6 +84,14 @@ class FieldError(UsageError):
         return self.line()
 
 
+class UnexpectedArgumentError(UsageError, TypeError):
+    """A keyword argument that a function does not have.
+
+    Python's own error for it as well: callers who offer what not every environment takes (TorchRL
+    its `frameskip`) look for that and try without.
+    """
+
+
 MACHINE_ERRORS = frozenset(
     {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS, errno.EMFILE, errno.ENFILE}
 )

@@ -109,10 +109,12 @@ class Decisions:
             last = flown.copy() if by_rates else flown[:, (0, 1, 3)]
         self.navigation.fly(chosen)
         now = self._before = self.navigation.flights()
-        truncated: NDArray[np.bool_] = now.verdict == Verdict.TIMEOUT
-        terminated = (now.verdict != Verdict.FLYING) & ~truncated
+        # What had ended before has not been flown.
+        ended = (now.verdict != Verdict.FLYING) & (before.verdict == Verdict.FLYING)
+        truncated: NDArray[np.bool_] = ended & (now.verdict == Verdict.TIMEOUT)
+        terminated = ended & ~truncated
         if self.curriculum is not None:
-            for i in np.flatnonzero(terminated | truncated):
+            for i in np.flatnonzero(ended):
                 success = bool(now.verdict[i] == Verdict.SUCCESS)
                 self.curriculum.record(int(self.navigation.zones[i]), success=success)
         step = Step(before, now, level, spec.episode.hold_s)

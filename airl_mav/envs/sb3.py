@@ -6,10 +6,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
+from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices, VecEnvStepReturn
 
+from airl_mav.core.errors import UsageError
 from airl_mav.envs.experts import Expert
 from airl_mav.envs.saved_state import Stateful
 from airl_mav.envs.spec import ExpertName
@@ -51,7 +53,16 @@ class NavigationVecEnv(Stateful, VecEnv):
     """
 
     def __init__(self, env: NavigationVectorEnv, watcher: Watcher | None = None) -> None:
-        """Wrap a vectorised environment; `watcher` looks on."""
+        """Wrap a vectorised environment; `watcher` looks on.
+
+        Raises:
+            UsageError: It resets at another time than stable-baselines3 expects.
+        """
+        if env.autoreset_mode != AutoresetMode.SAME_STEP:
+            raise UsageError(
+                f"autoreset_mode = {env.autoreset_mode.value!r}: accepted for stable-baselines3: "
+                f"{AutoresetMode.SAME_STEP.value}"
+            )
         self.env = env
         self._watcher = watcher
         super().__init__(env.num_envs, env.single_observation_space, env.single_action_space)

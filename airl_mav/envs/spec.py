@@ -10,7 +10,7 @@ from pydantic import (
     model_validator,
 )
 
-from airl_mav.core.errors import UsageError
+from airl_mav.core.errors import FieldError, UnexpectedArgumentError, UsageError
 from airl_mav.core.fields import Each, ProfileModel, later_field, quantity, validated
 from airl_mav.core.plugins import REWARDS, part_name
 from airl_mav.flight.judge import GOAL_RADIUS_M, TIME_LIMIT_S, GoalRadius, TimeLimit
@@ -438,9 +438,18 @@ def gymnasium_spec(spec: EnvironmentSpec | None, knobs: Mapping[str, Any]) -> En
     each way. (A training file's image is smaller by default: its networks are made for that.)
 
     Raises:
+        UnexpectedArgumentError: A knob that there is not.
         UsageError: As `spec_of`, or the vehicle's profile cannot be used.
     """
-    made = spec_of(spec, knobs)
+    try:
+        made = spec_of(spec, knobs)
+    except FieldError as error:
+        if error.field not in knobs.keys() - EnvironmentSpec.model_fields.keys():
+            raise
+        hint = error.problem.removeprefix("unknown field")
+        raise UnexpectedArgumentError(
+            f"unexpected keyword argument {error.field!r}{hint}"
+        ) from None
     if spec is not None or {"image_width_px", "image_height_px"} & knobs.keys():
         return made
     camera = made.camera.of(load_vehicle(made.vehicle).camera)

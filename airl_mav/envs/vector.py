@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from copy import deepcopy
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
@@ -41,15 +42,17 @@ AHEAD = 32
 
 
 class NavigationVectorEnv(Decisions, Stateful, VectorEnv[Encoded, NDArray[Any], NDArray[Any]]):
-    """N flights that reset in the step in which they end (Gymnasium's SAME_STEP).
+    """N flights; by default they reset in the step in which they end (Gymnasium's SAME_STEP).
 
     `info` is what Gymnasium's SyncVectorEnv makes of n `NavigationEnv`: `seed`, `zone`,
     `flight_time_s`, `distance_m`, `energy_j` and `goal_distance_m` of the episodes that go on; in
     `final_info` those of the ones that ended, with `success` and `outcome`, and in `final_obs` the
-    observation each ended with; a mask `_key` beside every key.
+    observation each ended with; a mask `_key` beside every key. Where the reset comes later, what
+    an episode ended with is in `info` itself.
     """
 
     metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}  # noqa: RUF012
+    autoreset_mode: AutoresetMode
 
     def __init__(
         self,
@@ -57,6 +60,7 @@ class NavigationVectorEnv(Decisions, Stateful, VectorEnv[Encoded, NDArray[Any], 
         spec: EnvironmentSpec | None = None,
         *,
         render_mode: str | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         **knobs: Any,
     ) -> None:
         """Make n environments.
@@ -65,6 +69,9 @@ class NavigationVectorEnv(Decisions, Stateful, VectorEnv[Encoded, NDArray[Any], 
             num_envs: N.
             spec: What they are made of; or
             render_mode: None. A single environment is what can be looked at.
+            autoreset_mode: When an episode that ended is followed by the next: in that step
+                (SAME_STEP), in the next one, whose action it does not fly (NEXT_STEP), or with a
+                reset whose `options["reset_mask"]` names it (DISABLED).
             knobs: the fields of an EnvironmentSpec.
 
         Raises:
@@ -77,7 +84,13 @@ class NavigationVectorEnv(Decisions, Stateful, VectorEnv[Encoded, NDArray[Any], 
                 f"render_mode = {render_mode!r}: n at a time draw no picture; accepted: None, or "
                 "make a single environment"
             )
+        try:
+            self.autoreset_mode = AutoresetMode(autoreset_mode)
+        except ValueError:
+            accepted = ", ".join(mode.value for mode in AutoresetMode)
+            raise UsageError(f"autoreset_mode = {autoreset_mode!r}: accepted: {accepted}") from None
         super().__init__(spec, knobs, num_envs)
+        self.metadata = self.metadata | {"autoreset_mode": self.autoreset_mode}
         self.num_envs = num_envs
         self.single_observation_space = observation_space(self.navigation.observation)
         self.single_action_space = action_space(self.environment.action_spec)
@@ -96,12 +109,16 @@ class NavigationVectorEnv(Decisions, Stateful, VectorEnv[Encoded, NDArray[Any], 
             seed: One number seeds the generator that all episodes' seeds are drawn from. A list
                 gives the first episodes' own seeds, as in `NavigationEnv.reset(seed)`; None in it
                 draws one.
-            options: `zone`, as in `NavigationEnv.reset`.
+            options: `zone`, as in `NavigationEnv.reset`; `reset_mask`, (n,) booleans: only these
+                begin anew, and `info` is about them.
 
         Raises:
             UsageError: A wrong option or seed, or not n seeds.
+            ResetNeeded: A mask leaves out a flight that has not begun.
             gymnasium.error.Error: The one seed is negative.
         """
+        options = dict(options or {})
+        chosen = self._chosen(options.pop("reset_mask", None))
         if seed is not None or options:
             self._zone = zone_option(options)
         own: list[int | None] = [None] * self.num_envs
@@ -117,10 +134,26 @@ class NavigationVectorEnv(Decisions, Stateful, VectorEnv[Encoded, NDArray[Any], 
                 raise UsageError(f"seed: {len(own)} numbers; accepted: {self.num_envs}")
             if given := [each for each in own if each is not None]:
                 self.np_random = np.random.default_rng(np.random.SeedSequence(given))
+        slots = np.flatnonzero(chosen).tolist()
+        own = [own[i] for i in slots]
         drawn = iter(draw_seeds(self.np_random, own.count(None)))
         seeds = [next(drawn) if each is None else each for each in own]
-        flights = self._begin(range(self.num_envs), seeds)
-        return self.navigation.observe(), _masked(self._quality(flights))
+        flights = self._begin(slots, seeds)
+        return self.navigation.observe(), _masked(self._quality(flights), chosen)
+
+    def _chosen(self, mask: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
+        """Return (n,) which flights `reset` begins. Raises UsageError and ResetNeeded."""
+        if mask is None:
+            return np.ones(self.num_envs, np.bool_)
+        mask = np.asarray(mask)
+        if mask.dtype != np.bool_ or mask.shape != (self.num_envs,) or not mask.any():
+            raise UsageError(
+                f"options: reset_mask of {mask.dtype} {mask.shape}, {np.count_nonzero(mask)} of "
+                f"them true: accepted: bool ({self.num_envs},), one true at least"
+            )
+        if self._before is None and not mask.all():
+            raise gym.error.ResetNeeded("reset() with a mask before all flights have begun")
+        return mask
 
     def step(
         self, actions: NDArray[Any]
@@ -128,20 +161,37 @@ class NavigationVectorEnv(Decisions, Stateful, VectorEnv[Encoded, NDArray[Any], 
         """Fly one decision of every vehicle; see Gymnasium's VectorEnv.step.
 
         Raises:
-            ResetNeeded: No episodes have begun.
+            ResetNeeded: No episodes have begun; or one has ended, and resets are not automatic.
             InvalidAction: Not n actions of the set; numbers beyond -1..1 are cut off.
         """
+        over = self._over()
+        if over.any() and self.autoreset_mode == AutoresetMode.DISABLED:
+            raise gym.error.ResetNeeded("step() after the end of an episode")
         now, reward, terminated, truncated = self._decide(actions, (self.num_envs,))
         seen = self.navigation.observe()
         ended = terminated | truncated
         final: dict[str, Any] = {}
-        if ended.any():
-            final = self._final(seen, now, ended)
-            slots = np.flatnonzero(ended).tolist()
+        begun = over
+        if self.autoreset_mode == AutoresetMode.SAME_STEP:
+            begun = ended
+            if ended.any():
+                final = self._final(seen, now, ended)
+        elif ended.any():
+            final = _masked(_outcomes(now, ended), ended)
+        if begun.any():
+            reward = np.where(over, 0.0, reward)
+            slots = np.flatnonzero(begun).tolist()
             now = self._begin(slots, self._next_seeds(len(slots)))
             for key, first in self.navigation.observe(slots).items():
                 seen[key][slots] = first
         return seen, reward, terminated, truncated, _masked(self._quality(now)) | final
+
+    def _over(self) -> NDArray[np.bool_]:
+        """Return (n,) which flights have ended in an earlier step and not begun anew."""
+        if self._before is None:
+            return np.zeros(self.num_envs, np.bool_)
+        over: NDArray[np.bool_] = self._before.verdict != Verdict.FLYING
+        return over
 
     def _next_seeds(self, n: int) -> list[int]:
         """Draw the seeds of n episodes; when their arenas are missing, make those of more ahead."""
@@ -154,20 +204,14 @@ class NavigationVectorEnv(Decisions, Stateful, VectorEnv[Encoded, NDArray[Any], 
 
     def _final(self, seen: Encoded, flights: Flights, ended: NDArray[np.bool_]) -> dict[str, Any]:
         """Return `final_obs` and `final_info` of the episodes that ended, and their masks."""
-        info: dict[str, NDArray[Any]] = {
-            key: np.where(ended, value, np.zeros_like(value))
-            for key, value in self._quality(flights).items()
-        }
-        info["success"] = flights.verdict == Verdict.SUCCESS
-        info["outcome"] = np.full(self.num_envs, None, dtype=object)
+        info = self._quality(flights) | _outcomes(flights, ended)
         observation = np.full(self.num_envs, None, dtype=object)
         for i in np.flatnonzero(ended).tolist():
-            info["outcome"][i] = outcome(flights, i)["outcome"]
             observation[i] = {key: value[i].copy() for key, value in seen.items()}
         return {
             "final_obs": observation,
             "_final_obs": ended.copy(),
-            "final_info": info | {f"_{key}": ended.copy() for key in info},
+            "final_info": _masked(info, ended),
             "_final_info": ended.copy(),
         }
 
@@ -211,7 +255,22 @@ class NavigationVectorEnv(Decisions, Stateful, VectorEnv[Encoded, NDArray[Any], 
             raise UsageError(f"state: of an environment with another {', '.join(changed)}")
 
 
-def _masked(values: dict[str, NDArray[Any]]) -> dict[str, Any]:
-    """Add masks that are all true."""
-    masks = {f"_{key}": np.ones(len(value), np.bool_) for key, value in values.items()}
-    return values | masks
+def _outcomes(flights: Flights, ended: NDArray[np.bool_]) -> dict[str, NDArray[Any]]:
+    """Return what `info` has in addition for flights that have ended."""
+    outcomes = np.full(len(ended), None, dtype=object)
+    for i in np.flatnonzero(ended).tolist():
+        outcomes[i] = outcome(flights, i)["outcome"]
+    return {"success": flights.verdict == Verdict.SUCCESS, "outcome": outcomes}
+
+
+def _masked(
+    values: dict[str, NDArray[Any]], told: NDArray[np.bool_] | None = None
+) -> dict[str, Any]:
+    """Add masks of the rows that are told, all of them by default; the others become 0 or None."""
+    if told is None:
+        return values | {f"_{key}": np.ones(len(value), np.bool_) for key, value in values.items()}
+    rows = {
+        key: value if value.dtype == object else np.where(told, value, np.zeros_like(value))
+        for key, value in values.items()
+    }
+    return rows | {f"_{key}": told.copy() for key in rows}

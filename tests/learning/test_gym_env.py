@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import types
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -184,7 +185,7 @@ def test_make_vec_is_the_compiled_one() -> None:
 @pytest.mark.parametrize(
     ("knobs", "message"),
     [
-        ({"arean": "x"}, "arean: unknown field; did you mean 'arena'?"),
+        ({"arean": "x"}, "unexpected keyword argument 'arean'; did you mean 'arena'?"),
         (
             {"reward": "best"},
             "reward 'best': accepted: 'shaped', .*'paper', FILE.py:NAME or MOD",
@@ -210,6 +211,25 @@ def test_a_wrong_knob_gets_one_clear_line(knobs: dict[str, Any], message: str) -
     if "render_mode" not in knobs:
         with pytest.raises(UsageError, match=message):
             NavigationVectorEnv(2, **knobs)
+
+
+def test_what_is_offered_to_every_environment_is_refused_as_python_refuses_it() -> None:
+    """TorchRL offers `frameskip`, and tries without where that is a TypeError."""
+    for make in (gym.make, partial(gym.make_vec, num_envs=2)):
+        with pytest.raises(TypeError, match="unexpected keyword argument 'frameskip'"):
+            make(NAVIGATION, frameskip=1)
+        with pytest.raises(UsageError) as caught:
+            make(NAVIGATION, episode={"frameskip": 1})
+        assert not isinstance(caught.value, TypeError), "a field of one, and no argument"
+
+
+def test_gymnasium_s_wrappers_of_observations_take_the_vector_environment() -> None:
+    env = gym.make_vec(NAVIGATION, num_envs=3, autoreset_mode="NextStep", arena="no-obstacles")
+    flat = gym.wrappers.vector.NormalizeObservation(gym.wrappers.vector.FlattenObservation(env))
+    flat.reset(seed=1)
+    seen = flat.step(np.array([2, 2, 2]))[0]
+    assert seen.shape == (3, 64 * 48 + 6)
+    assert np.isfinite(seen).all()
 
 
 def test_wrong_arguments_of_the_vector_environment() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections import deque
+from collections.abc import Iterator
 from functools import partial
 from typing import Any
 
@@ -80,45 +81,92 @@ def make_scripted(knobs: dict[str, Any], seeds: deque[int]) -> gym.Env[Any, Any]
     return Scripted(NavigationEnv(**knobs), seeds)
 
 
+def flown(env: Any, seeds: list[int | None], actions: list[Any]) -> Iterator[Any]:
+    """Yield what reset and step return, with the resets that are the caller's."""
+    yield env.reset(seed=seeds)
+    ended = np.zeros(env.num_envs, np.bool_)
+    for action in actions:
+        if ended.any() and env.autoreset_mode == AutoresetMode.DISABLED:
+            yield env.reset(options={"reset_mask": ended})
+        result = env.step(action)
+        ended = result[2] | result[3]
+        yield result
+
+
 @pytest.mark.parametrize(
     "knobs",
     [BUSY, {"actions": "velocity", "episode": {"time_limit_s": 6.0}, "reward": "paper"}],
     ids=["busy", "plain"],
 )
-def test_equals_gymnasium_s_own_vector_of_single_environments(knobs: dict[str, Any]) -> None:
-    """Observations, rewards, endings, infos with masks; resets happen in the same step."""
+@pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mode: str(mode.name.lower()))
+def test_equals_gymnasium_s_own_vector_of_single_environments(
+    knobs: dict[str, Any], mode: AutoresetMode
+) -> None:
+    """Observations, rewards, endings, infos with masks; resets when the mode says."""
     n, steps = 4, 60
     seeds: list[int | None] = [3, 1, 4, 15]
-    env = NavigationVectorEnv(n, **knobs)
+    env = NavigationVectorEnv(n, autoreset_mode=mode, **knobs)
     env.action_space.seed(0)
     actions = [env.action_space.sample() for _ in range(steps)]
-    results: list[Any] = [env.reset(seed=seeds)]
+    results = list(flown(env, seeds, actions))
     later: list[deque[int]] = [deque() for _ in range(n)]
-    for action in actions:
-        result = env.step(action)
-        results.append(result)
-        for i in np.flatnonzero(result[2] | result[3]):
-            later[i].append(int(result[4]["seed"][i]))
+    present = np.array(seeds)
+    for *_, info in results[1:]:
+        for i in np.flatnonzero(info["_seed"] & (info["seed"] != present)):
+            present[i] = info["seed"][i]
+            later[i].append(int(present[i]))
     assert min(len(each) for each in later) >= 2, "every slot began anew"
     outcomes = {
         str(each)
         for result in results[1:]
-        for each in result[4].get("final_info", {}).get("outcome", [])
+        for each in result[-1].get("final_info", result[-1]).get("outcome", [])
     }
     assert len(outcomes - {"None"}) >= 2, "not all of them ended alike"
 
     own = SyncVectorEnv(
-        [partial(make_scripted, knobs, later[i]) for i in range(n)],
-        autoreset_mode=AutoresetMode.SAME_STEP,
+        [partial(make_scripted, knobs, later[i]) for i in range(n)], autoreset_mode=mode
     )
     assert own.single_observation_space == env.single_observation_space
     assert own.observation_space == env.observation_space
     assert own.action_space == env.action_space
-    assert own.metadata["autoreset_mode"] == env.metadata["autoreset_mode"]
-    assert_same(results[0], own.reset(seed=seeds))
-    for k, action in enumerate(actions):
-        assert_same(results[k + 1], own.step(action), f"step {k}")
+    assert own.metadata["autoreset_mode"] == env.metadata["autoreset_mode"] == mode
+    assert own.autoreset_mode == env.autoreset_mode
+    for k, theirs in enumerate(flown(own, seeds, actions)):
+        assert_same(results[k], theirs, f"call {k}")
+    assert k == len(results) - 1
     assert all(not each for each in later)
+
+
+def test_without_automatic_resets_a_flight_that_has_ended_is_reset_or_refused() -> None:
+    knobs: dict[str, Any] = {"arena": "no-obstacles", "episode": {"time_limit_s": 1.0}}
+    env = NavigationVectorEnv(2, autoreset_mode="Disabled", **knobs)
+    with pytest.raises(gym.error.ResetNeeded, match="before all flights have begun"):
+        env.reset(options={"reset_mask": np.array([True, False])})
+    env.reset(seed=1, options={"zone": 2})
+    while not env.step(np.array([2, 2]))[3].any():
+        pass
+    with pytest.raises(gym.error.ResetNeeded, match="after the end"):
+        env.step(np.array([2, 2]))
+    for wrong in ([True], np.array([1, 0]), np.array([False, False])):
+        with pytest.raises(UsageError, match="options: reset_mask of"):
+            env.reset(options={"reset_mask": wrong})
+    options = {"reset_mask": np.array([True, True])}
+    info = env.reset(seed=[7, 8], options=options)[1]
+    assert (info["seed"].tolist(), info["zone"].tolist()) == ([7, 8], [-1, -1])
+    assert list(options) == ["reset_mask"], "the caller's own is left as it was"
+    with pytest.raises(UsageError, match="autoreset_mode = 'never': accepted: NextStep, SameStep"):
+        NavigationVectorEnv(2, autoreset_mode="never", **knobs)
+    with pytest.raises(UsageError, match="'Disabled': accepted for stable-baselines3: SameStep"):
+        NavigationVecEnv(env)
+
+
+def test_a_curriculum_counts_a_flight_once_however_late_the_next_begins() -> None:
+    knobs: dict[str, Any] = {"arena": "no-obstacles", "episode": {"goal_radius_m": 50}}
+    for mode, zones in (("SameStep", [0, 1, 1, 2]), ("NextStep", [0, 0, 0, 1])):
+        env = NavigationVectorEnv(4, autoreset_mode=mode, curriculum={"window": 6}, **knobs)
+        env.reset(seed=1)
+        found = [env.step(np.full(4, 22))[4]["zone"].max() for _ in range(4)]
+        assert found == zones, mode
 
 
 def test_one_vehicle_draws_the_same_later_episodes_as_the_single_environment() -> None:
