@@ -13,6 +13,7 @@ from __future__ import annotations
 import gymnasium as gym
 
 NAVIGATION = "airl/Navigation-v0"
+REHEARSAL = "airl/Rehearsal-v0"
 
 if NAVIGATION not in gym.registry:
     gym.register(
@@ -20,3 +21,6 @@ if NAVIGATION not in gym.registry:
         entry_point="airl_mav.envs.single:NavigationEnv",
         vector_entry_point="airl_mav.envs.vector:NavigationVectorEnv",
     )
+
+if REHEARSAL not in gym.registry:
+    gym.register(id=REHEARSAL, entry_point="airl_mav.lockstep.gym_env:RehearsalEnv")

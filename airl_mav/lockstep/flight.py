@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
@@ -22,6 +22,7 @@ from airl_mav.lockstep.digest import FlightDigest, Unwitnessed, WitnessedPolicy
 from airl_mav.lockstep.judging import Judge
 from airl_mav.lockstep.link import real_vehicle
 from airl_mav.lockstep.stage import Stage
+from airl_mav.lockstep.threaded import PATIENCE_S
 from airl_mav.lockstep.turns import LockstepError
 from airl_mav.policy.actions import Policy
 from airl_mav.rehearsal.channel import Text
@@ -117,7 +118,7 @@ def fly(
     observer = observer or Observer()
     notes: list[str] = []
     while True:
-        flight = _Flight(resolved, policy, index, seed, observer, notes, view)
+        flight = Flight(resolved, policy, index, seed, observer=observer, notes=notes, view=view)
         try:
             return flight.fly(tlog, log)
         except FirmwareLostError as error:
@@ -132,8 +133,8 @@ def fly(
             policy = resolved.fresh_policy(seed)
 
 
-class _Flight:
-    """The parts of one flight."""
+class Flight:
+    """One flight, from take-off to landing; it is flown once."""
 
     def __init__(
         self,
@@ -141,15 +142,35 @@ class _Flight:
         policy: Policy,
         index: int,
         seed: int,
-        observer: Observer,
-        notes: Sequence[str],
-        view: ViewEnds | None,
+        *,
+        observer: Observer | None = None,
+        notes: Sequence[str] = (),
+        view: ViewEnds | None = None,
+        patience_s: float = PATIENCE_S,
+        ticked: Callable[[Simulation, Referee, str | None], None] = lambda *_: None,
     ) -> None:
+        """Take what is flown, as `fly` does; nothing is made yet.
+
+        Args:
+            resolved: The scenario.
+            policy: What decides, as it begins a flight.
+            index: Number of the episode in its run.
+            seed: Of arena, sensors, wind and latency.
+            observer: Who looks on.
+            notes: What its record is to say beside its own.
+            view: Where it is watched; None: nowhere.
+            patience_s: Longest decision of the policy [s of wall time].
+            ticked: Called after every tick, with what has been hit so far.
+        """
         self._view = view
         self._watched: Watched | None = None
+        self._patience_s = patience_s
+        self._ticked = ticked
+        self._abandon: threading.Event | None = None
+        self._called_off = False
         self._notes = tuple(notes)
         self._resolved, self._policy, self._index, self._seed = resolved, policy, index, seed
-        self._observer = observer
+        self._observer = observer or Observer()
         self._ticks = 0
         self._arena = resolved.arena_of(seed)
         self._goal = self._arena.goal_point
@@ -160,7 +181,21 @@ class _Flight:
         self._judge = Judge(self._supervisor, self._digest, order=self._order, judged=self._decided)
         self._result: MissionResult | None = None
 
-    def fly(self, tlog: Path | None, log: Path | None) -> FlownEpisode:
+    def call_off(self) -> None:
+        """End it where it is, without a landing, as soon as the policy gives its turn back."""
+        self._called_off = True
+        self._stop.set()
+        if self._abandon is not None:
+            self._abandon.set()
+
+    def fly(self, tlog: Path | None = None, log: Path | None = None) -> FlownEpisode:
+        """Fly it; see the function `fly`.
+
+        Raises:
+            UsageError: As `fly`.
+            LockstepError: The companion hangs, or broke.
+            FirmwareLostError: Real firmware was lost.
+        """
         resolved = self._resolved
         setup = EpisodeSetup(
             resolved.vehicle,
@@ -184,8 +219,12 @@ class _Flight:
                     speed=resolved.speed if self._view is None else None,
                     faults=resolved.scenario.faults,
                     vehicle=vehicle,
+                    patience_s=self._patience_s,
                 )
             )
+            self._abandon = self._stage.abandon
+            if self._called_off:
+                self._abandon.set()
             self._stage.firmware.on_tick = self._look
             self._stage.firmware.on_message = self._hear
             if self._watched is not None:
@@ -246,6 +285,7 @@ class _Flight:
     def _look(self, simulation: Simulation) -> None:
         """Take the true state after a tick."""
         self._judge.look(simulation)
+        self._ticked(simulation, self._supervisor.referee, self._judge.hit)
         if self._watched is not None:
             self._watched.tick(simulation, self._judge.hit)
         self._ticks += 1

@@ -16,7 +16,7 @@ from airl_mav.lockstep.camera import MemoryCamera
 from airl_mav.lockstep.conductor import Conductor
 from airl_mav.lockstep.digest import FlightDigest
 from airl_mav.lockstep.link import BOOT_UNIX_US, ConductedVehicle, builtin_vehicle
-from airl_mav.lockstep.threaded import ThreadPartner
+from airl_mav.lockstep.threaded import PATIENCE_S, ThreadPartner
 from airl_mav.lockstep.turns import COMPANION_STARTS_US, LockstepError
 from companion.conducted import ConductedClock
 from companion.interfaces import LinkError
@@ -47,6 +47,7 @@ class Stage:
         speed: float | None = None,
         faults: Sequence[Fault] = (),
         vehicle: ConductedVehicle | None = None,
+        patience_s: float = PATIENCE_S,
     ) -> None:
         """Put everything together; nothing moves yet.
 
@@ -56,10 +57,11 @@ class Stage:
             speed: Greatest number of simulated seconds per wall second; None: as fast as it goes.
             faults: What the episode's aircraft has of them; only those of the link matter here.
             vehicle: What flies, released with the stage; None: the built-in autopilot.
+            patience_s: Longest turn of the companion [s of wall time].
         """
         clock = SimClock()
         self._vehicle = vehicle = vehicle or builtin_vehicle(clock, faults)
-        self._partner = ThreadPartner()
+        self._partner = ThreadPartner(patience_s)
         self.abandon = threading.Event()
         """Makes the link break off whatever it waits for."""
         self.conductor = Conductor(vehicle.end, self._partner, digest, speed, clock)

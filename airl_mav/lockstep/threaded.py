@@ -26,7 +26,7 @@ FIRST_BARRIER = 0x8000_0000
 """Sequence number of the first barrier's PING: those of the autopilot's own stream stay below."""
 
 PATIENCE_S = 60
-"""Longest turn of the companion [s of wall time, while this process runs]."""
+"""Longest turn of the companion, by default [s of wall time, while this process runs]."""
 
 PING_AGAIN_S = 0.1
 """A barrier's PING is repeated after so long without an answer [wall s]."""
@@ -43,7 +43,9 @@ _PING: int = dialect.MAVLINK_MSG_ID_PING
 class ThreadPartner:
     """Runs a companion. Implements `turns.Partner`."""
 
-    def __init__(self) -> None:
+    def __init__(self, patience_s: float = PATIENCE_S) -> None:
+        """Nobody is attached yet; `patience_s` is the longest turn [s of wall time]."""
+        self._patience_s = patience_s
         self.error: BaseException | None = None
         """What ended the companion, if it was not its own end."""
         # Of the standard library's queues the one that never blocks the putter: MAVSDK's thread
@@ -135,7 +137,7 @@ class ThreadPartner:
         """Wait for the end of the companion's turn, or until it waits for an answer: for what."""
         waited = Patience()
         heartbeat_s = HEARTBEAT_S
-        while waited.so_far_s() < PATIENCE_S:
+        while waited.so_far_s() < self._patience_s:
             with suppress(Empty):
                 item = self._inbox.get(timeout=HEARTBEAT_S)
                 if not isinstance(item, bytes):
@@ -147,7 +149,7 @@ class ThreadPartner:
                 # then finds no autopilot to connect to.
                 self._feed(self._heartbeat)
                 heartbeat_s += HEARTBEAT_S
-        raise LockstepError(f"the companion hangs: its turn did not end in {PATIENCE_S} s")
+        raise LockstepError(f"the companion hangs: its turn did not end in {self._patience_s:g} s")
 
     @property
     def _setpoints_sent(self) -> int:

@@ -43,6 +43,8 @@ class PolicyInfo:
     """Where a learned one lies."""
     program: str | None = None
     """FILE.py:CLASS or MODULE:CLASS of one that is written in Python."""
+    asked: CommandKind | None = None
+    """What it commands, of one that is never loaded: somebody else is asked for its decisions."""
 
     @property
     def sha256(self) -> str | None:
@@ -54,6 +56,8 @@ class PolicyInfo:
     @property
     def commands(self) -> CommandKind:
         """What it commands. Raises FieldError when a class of the user's says nonsense."""
+        if self.asked is not None:
+            return self.asked
         if self.program is not None:
             return command_kind(_policy_class(self.program))
         return "velocity" if self.card is None else self.card.actions.commands
@@ -67,9 +71,11 @@ class PolicyInfo:
 def camera_refused(policy: PolicyInfo, vehicle: VehicleProfile) -> str | None:
     """Return why a vehicle's cameras cannot serve a policy, or None when they can, if it is known.
 
-    Of a policy that is written in Python nothing is.
+    Of a policy that is written in Python, or only asked, nothing is.
     """
     camera = vehicle.camera
+    if policy.asked is not None:
+        return None
     if policy.card is not None:
         return vehicle_mismatch(policy.card, camera, vehicle.cameras)
     if policy.program is None and camera.kind != "depth":

@@ -9,7 +9,7 @@ from airl_mav.core.errors import FieldError
 from airl_mav.flight.judge import GOAL_RADIUS_M
 from airl_mav.latency.injection import Injection, without_timing
 from airl_mav.latency.source import select_injection
-from airl_mav.policy.registry import camera_refused, find_policy
+from airl_mav.policy.registry import PolicyInfo, camera_refused, find_policy
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loaded import check_spread, equipped
 from airl_mav.profiles.loading import load_profile
@@ -32,8 +32,12 @@ from airl_mav.scenario.piloting import (
 from airl_mav.scenario.resolved import ResolvedScenario
 
 
-def resolve(scenario: Scenario) -> ResolvedScenario:
+def resolve(scenario: Scenario, policy: PolicyInfo | None = None) -> ResolvedScenario:
     """Check all that can be wrong before anything starts, and load all that the scenario names.
+
+    Args:
+        scenario: What is asked for.
+        policy: What decides in place of the policy that the scenario names; None: that one.
 
     Raises:
         UsageError: A field contradicts another, a profile or the policy cannot be used, or no
@@ -46,7 +50,7 @@ def resolve(scenario: Scenario) -> ResolvedScenario:
     if scenario.level == "sitl":
         # The companion connects to the camera by its number: it cannot be "any free one" here.
         check_ports(scenario.open_ports, any_camera=False)
-    policy = find_policy(scenario.policy, trust=scenario.trust)
+    policy = policy or find_policy(scenario.policy, trust=scenario.trust)
     check_commands(policy, scenario.policy, level=scenario.level, firmware=scenario.firmware)
     pilot, watchdog = decide_piloting(scenario, policy, GOAL_RADIUS_M)
     vehicle, computer = equipped(scenario.vehicle, scenario.computer, scenario.payload)
@@ -78,7 +82,8 @@ def resolve(scenario: Scenario) -> ResolvedScenario:
     # What cannot be flown is better found here than by a process that is already flying.
     goal = resolved.arena_of(scenario.seed).goal_point
     check_goal_height(policy, goal, "arena", scenario.arena)
-    resolved.fresh_policy(scenario.seed)
+    if policy.asked is None:
+        resolved.fresh_policy(scenario.seed)
     resolved.compensator()
     return resolved
 

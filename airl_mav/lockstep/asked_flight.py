@@ -1,0 +1,173 @@
+"""A flight in lockstep whose decisions are asked for, one by one."""
+
+from __future__ import annotations
+
+import math
+from queue import SimpleQueue
+from threading import Thread
+
+import numpy as np
+
+from airl_mav.arena.geometry import Arena
+from airl_mav.core.constants import TICK_S, US_PER_S, CommandKind
+from airl_mav.core.goals import goal_distance_m
+from airl_mav.envs.contact import CEILING, FLOOR, NOTHING, WALL
+from airl_mav.envs.fleet import Verdict
+from airl_mav.envs.navigation import Flights
+from airl_mav.flight.judge import Outcome, Referee
+from airl_mav.lockstep.flight import Flight
+from airl_mav.policy.actions import Action, AnyAction, BodyRates
+from airl_mav.policy.observation import Observation
+from airl_mav.rehearsal.run_folder import FlownEpisode
+from airl_mav.scenario.resolved import ResolvedScenario
+from firmware_sim.simulation import Simulation
+
+VERDICTS = {
+    Outcome.SUCCESS: Verdict.SUCCESS,
+    Outcome.COLLISION: Verdict.COLLISION,
+    Outcome.BATTERY: Verdict.BATTERY,
+    Outcome.TIMEOUT: Verdict.TIMEOUT,
+    # It is neither a success nor a failure of whoever decides.
+    Outcome.ABORTED: Verdict.FLYING,
+}
+
+IDLE: dict[CommandKind, AnyAction] = {
+    "velocity": Action(0.0, 0.0, 0.0),
+    "body_rates": BodyRates(0.0, 0.0, 0.0, 0.0),
+}
+"""What a flight that is called off is answered with; it is not sent any more."""
+
+
+class AskedFlight:
+    """A flight on a thread of its own, which waits for every decision.
+
+    Implements `actions.Policy` for the companion. All other methods are for one other thread; they
+    return while the flight waits, so that its state stands.
+    """
+
+    def __init__(self, resolved: ResolvedScenario, seed: int, arena: Arena) -> None:
+        """Begin a flight: it takes off, and asks for the first decision."""
+        self._events: SimpleQueue[Observation | FlownEpisode | BaseException] = SimpleQueue()
+        self._answers: SimpleQueue[AnyAction] = SimpleQueue()
+        self._account = _Account(arena)
+        self._idle = IDLE[resolved.pilot.commands]
+        self._flight = Flight(
+            resolved, self, 0, seed, patience_s=math.inf, ticked=self._account.ticked
+        )
+        self._end: FlownEpisode | BaseException | None = None
+        self._thread = Thread(target=self._fly, name="rehearsal", daemon=True)
+        self._thread.start()
+
+    def act(self, observation: Observation) -> AnyAction:
+        """Ask for a decision, on the companion's thread."""
+        self._events.put(observation)
+        return self._answers.get()
+
+    def asked(self) -> Observation | FlownEpisode:
+        """Return what the next decision is to be made on, or the flight when it is over.
+
+        Raises:
+            UsageError: It cannot be flown.
+            LockstepError: The companion hangs, or broke.
+            FirmwareLostError: Real firmware was lost.
+        """
+        event = self._events.get()
+        if not isinstance(event, Observation):
+            self._end = event
+        if isinstance(event, BaseException):
+            raise event
+        return event
+
+    def answer(self, action: AnyAction) -> Observation | FlownEpisode:
+        """Fly a decision until the next one is asked for; see `asked`."""
+        self._answers.put(action)
+        return self.asked()
+
+    def flights(self) -> Flights:
+        """Return how the flight stands, or how it stood at its verdict: arrays (1,)."""
+        return self._account.flights()
+
+    def outcome(self) -> Outcome | None:
+        """Return how it has ended; None: it has not."""
+        return self._account.outcome()
+
+    def end(self) -> FlownEpisode | None:
+        """Call it off, where it is not over; return the flight when it has ended.
+
+        None: it has ended by an error.
+        """
+        if self._end is None:
+            self._flight.call_off()
+            self._answers.put(self._idle)
+            while isinstance(event := self._events.get(), Observation):
+                self._answers.put(self._idle)
+            self._end = event
+        self._thread.join()
+        return self._end if isinstance(self._end, FlownEpisode) else None
+
+    def _fly(self) -> None:
+        try:
+            event: FlownEpisode | BaseException = self._flight.fly()
+        except BaseException as error:  # handed to whoever asks
+            event = error
+        self._events.put(event)
+
+
+class _Account:
+    """What a flight has come to, tick by tick; as the batch twin keeps it."""
+
+    def __init__(self, arena: Arena) -> None:
+        self._arena = arena
+        self._simulation: Simulation | None = None
+        self._referee: Referee | None = None
+        self._hit: str | None = None
+        self._here: tuple[float, float, float] | None = None
+        self._distance_m = self._energy_j = 0.0
+        self._at_verdict: Flights | None = None
+
+    def ticked(self, simulation: Simulation, referee: Referee, hit: str | None) -> None:
+        """Take the true state after a tick."""
+        plant = simulation.plant
+        before, self._here = self._here, plant.position
+        self._simulation, self._referee, self._hit = simulation, referee, hit
+        if referee.navigation_us is None or self._at_verdict is not None:
+            return
+        if before is not None:
+            self._distance_m += math.dist(before, plant.position)
+        self._energy_j += plant.power_w * TICK_S
+        if referee.verdict is not None:
+            self._at_verdict = self._now()
+
+    def flights(self) -> Flights:
+        """Return how it stands, or stood at the verdict."""
+        return self._at_verdict or self._now()
+
+    def outcome(self) -> Outcome | None:
+        """Return how it was judged; None: not yet."""
+        verdict = None if self._referee is None else self._referee.verdict
+        return None if verdict is None else verdict.outcome
+
+    def _now(self) -> Flights:
+        simulation, referee = self._simulation, self._referee
+        assert simulation is not None  # noqa: S101 (nobody asks before the first tick)
+        assert referee is not None  # noqa: S101
+        truth, outcome = simulation.truth, self.outcome()
+        began_us = simulation.time_us if referee.navigation_us is None else referee.navigation_us
+        return Flights(
+            verdict=np.array([Verdict.FLYING if outcome is None else VERDICTS[outcome]], np.int64),
+            time_s=np.array([(simulation.time_us - began_us) / US_PER_S]),
+            distance_m=np.array([self._distance_m]),
+            energy_j=np.array([self._energy_j]),
+            goal_distance_m=np.array([goal_distance_m(referee.task.goal, truth.position)]),
+            speed_m_s=np.array([np.linalg.norm(truth.velocity)]),
+            battery=np.array([truth.battery_remaining]),
+            touched=np.array([self._touched()]),
+        )
+
+    def _touched(self) -> int:
+        """Return what has been hit, as the batch twin numbers it."""
+        room = {None: NOTHING, "floor": FLOOR, "wall": WALL, "ceiling": CEILING}
+        if self._hit in room:
+            return room[self._hit]
+        names = map(self._arena.name_of, range(len(self._arena.obstacles)))
+        return next((i for i, name in enumerate(names) if name == self._hit), NOTHING)

@@ -1,0 +1,185 @@
+"""`airl/Rehearsal-v0`: a rehearsal in lockstep, decision by decision, in Gymnasium's API."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from airl_mav.core.errors import FieldError, UsageError
+from airl_mav.envs.decisions import (
+    action_space,
+    checked_actions,
+    draw_seeds,
+    episode_seed,
+    observation_space,
+    zone_option,
+)
+from airl_mav.envs.delay import bounded
+from airl_mav.envs.navigation import Flights
+from airl_mav.envs.rewards import Step, costs, reward_of
+from airl_mav.envs.sight import sight_of
+from airl_mav.envs.spec import EnvironmentSpec, gymnasium_spec
+from airl_mav.flight.judge import Outcome
+from airl_mav.lockstep.asked_flight import AskedFlight
+from airl_mav.lockstep.spec_scenario import BESIDE, scenario_of
+from airl_mav.policy.action_sets import command, commands
+from airl_mav.policy.layouts import encode_layout
+from airl_mav.policy.observation import Observation
+from airl_mav.policy.observation_spec import Encoded
+from airl_mav.policy.registry import PolicyInfo
+from airl_mav.rehearsal.run_folder import FlownEpisode
+from airl_mav.scenario.resolve import resolve
+from airl_mav.scenario.resolved import ResolvedScenario
+from firmware_sim.warm_up import warm_up
+
+
+class RehearsalEnv(gym.Env[Encoded, Any]):
+    """One vehicle that flies to its goal as in a rehearsal: `airl/Navigation-v0` for real.
+
+    Spaces, actions, rewards and `info` are those of `NavigationEnv`, and so are the keyword
+    arguments. What flies is all of level lockstep: plant, flight controller (PX4 too), MAVLink,
+    MAVSDK and the companion, which asks for its decisions here. `reset` takes off; what follows the
+    last decision of an episode, a landing, is not flown.
+
+    A flight that is neither judged a success nor a failure (the companion has ended it, say, by one
+    of its limits) is truncated; its `outcome` is `aborted`. The observation that an episode ends
+    with is the newest that was asked about: where the vehicle has crashed, or time is up, no other
+    has been made.
+    """
+
+    metadata = {"render_modes": []}  # noqa: RUF012
+
+    def __init__(
+        self, spec: EnvironmentSpec | None = None, *, render_mode: str | None = None, **knobs: Any
+    ) -> None:
+        """Make the environment; nothing is started.
+
+        Args:
+            spec: What it is made of; or
+            render_mode: None.
+            knobs: the fields of an EnvironmentSpec; and, in either case, those of a Scenario that
+                say what it does not: firmware, real, plant, faults and the others of
+                `spec_scenario.BESIDE`.
+
+        Raises:
+            UsageError: A knob or a profile cannot be used, or it is one of the batch twin alone.
+        """
+        if render_mode is not None:
+            raise UsageError(f"render_mode = {render_mode!r}: accepted: None")
+        beside = {name: knobs.pop(name) for name in BESIDE if name in knobs}
+        self.environment = bounded(gymnasium_spec(spec, knobs))
+        self._reward = reward_of(self.environment.reward)
+        actions = self.environment.action_spec
+        asked = PolicyInfo("asked", "decides by Gymnasium's API", asked=actions.commands)
+        self._resolved: ResolvedScenario = resolve(scenario_of(self.environment, beside), asked)
+        self._sees = sight_of(self.environment, self._resolved.vehicle).observation
+        flat = len(self._resolved.arena_of(self._resolved.scenario.seed).goal_point) == 2
+        if self._sees.goal_height and flat:
+            accepted = f"false in arena {self.environment.arena!r}, whose goals have none"
+            raise FieldError("goal_height", True, accepted)
+        warm_up(self._resolved.vehicle, self._resolved.scenario.plant)
+        self.observation_space: gym.Space[Any] = observation_space(self._sees)
+        self.action_space = action_space(actions)
+        self.flown: FlownEpisode | None = None
+        """The newest episode that was flown to its end: record, true path, latencies."""
+        self._flight: AskedFlight | None = None
+        self._ending: Any = None
+        self._seed = 0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Encoded, dict[str, Any]]:
+        """Take off, and return what the first decision is to be made on.
+
+        Args:
+            seed: As of `NavigationEnv.reset`.
+            options: As of `NavigationEnv.reset`.
+
+        Raises:
+            UsageError: A wrong option or seed, no arena can be made of the seed, no PX4 is there.
+            LockstepError: The companion hangs, or broke.
+            gymnasium.error.Error: The seed is negative, or the vehicle has not taken off.
+        """
+        self.close()
+        if seed is not None or options:
+            zone = zone_option(options)
+            scenario = self._resolved.scenario.model_copy(update={"zone": zone})
+            self._resolved = replace(self._resolved, scenario=scenario)
+        super().reset(seed=seed)
+        self._seed = draw_seeds(self.np_random, 1)[0] if seed is None else episode_seed(seed)
+        flight = AskedFlight(self._resolved, self._seed, self._resolved.arena_of(self._seed))
+        self._flight, self._ending = flight, weakref.finalize(self, flight.end)
+        asked = self._heard(flight.asked)
+        if isinstance(asked, FlownEpisode):
+            raise gym.error.Error(f"seed {self._seed}: it has not taken off: {asked.record.reason}")
+        self._newest = self._encode(asked)
+        self._before = flight.flights()
+        self._last = np.zeros((1, 4 if self.environment.actions == "body-rates" else 3))
+        return self._newest, self._info(self._before)
+
+    def step(self, action: Any) -> tuple[Encoded, float, bool, bool, dict[str, Any]]:
+        """Fly one decision; see Gymnasium's Env.step.
+
+        Raises:
+            ResetNeeded: No episode has begun, or it has ended.
+            InvalidAction: The action is none of the set; numbers beyond -1..1 are cut off.
+            LockstepError: The companion hangs, or broke.
+            FirmwareLostError: Real firmware was lost; the episode is over.
+        """
+        flight, spec = self._flight, self.environment.action_spec
+        if flight is None:
+            raise gym.error.ResetNeeded(
+                "step() without an episode that goes on: reset() begins one"
+            )
+        number = checked_actions(spec, action, ())
+        asked = self._heard(lambda: flight.answer(command(spec, number)))
+        before, now, outcome = self._before, flight.flights(), flight.outcome()
+        level = commands(spec, number[None])[:, : self._last.shape[1]]
+        step = Step(before, now, level, self.environment.episode.hold_s)
+        reward = self._reward(step) - costs(self.environment.costs, self._last, step)
+        self._before, self._last = now, level
+        if isinstance(asked, Observation):
+            self._newest = self._encode(asked)
+        else:
+            self._newest = {key: array.copy() for key, array in self._newest.items()}
+        info = self._info(now)
+        if outcome is not None:
+            info |= {"success": outcome is Outcome.SUCCESS, "outcome": outcome.value}
+            self.flown = flight.end()
+            self.close()
+        truncated = outcome in (Outcome.TIMEOUT, Outcome.ABORTED)
+        terminated = outcome is not None and not truncated
+        return self._newest, float(reward[0]), terminated, truncated, info
+
+    def close(self) -> None:
+        """End the flight, if there is one."""
+        if self._ending is not None:
+            self._ending()
+        self._flight = self._ending = None
+
+    def _heard(self, ask: Callable[[], Observation | FlownEpisode]) -> Observation | FlownEpisode:
+        """Return what the flight asks, or the flight; it is over where it raises, too."""
+        try:
+            return ask()
+        except Exception:
+            self.close()
+            raise
+
+    def _encode(self, asked: Observation) -> Encoded:
+        return {key: rows[0] for key, rows in encode_layout(self._sees, asked.rows(None)).items()}
+
+    def _info(self, now: Flights) -> dict[str, Any]:
+        zone = self._resolved.scenario.zone
+        return {
+            "seed": self._seed,
+            "zone": -1 if zone is None else zone,
+            "flight_time_s": float(now.time_s[0]),
+            "distance_m": float(now.distance_m[0]),
+            "energy_j": float(now.energy_j[0]),
+            "goal_distance_m": float(now.goal_distance_m[0]),
+        }

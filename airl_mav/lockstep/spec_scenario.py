@@ -1,0 +1,82 @@
+"""The scenario that flies an environment of the batch twin in lockstep."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import reduce
+from typing import Any
+
+from airl_mav.core.errors import FieldError
+from airl_mav.envs.spec import EnvironmentSpec
+from airl_mav.profiles.conditions import SensorNoise, Spread
+from airl_mav.scenario.model import Scenario, WatchdogSettings
+
+BESIDE = (
+    "firmware",
+    "real",
+    "plant",
+    "estimator",
+    "renderer",
+    "faults",
+    "payload",
+    "battery_charge",
+    "origin",
+    "limits",
+    "arena_seed",
+    "latency_seed",
+    "speed",
+)
+"""Fields of a `Scenario` that say what an `EnvironmentSpec` does not."""
+
+TWIN_ALONE = (
+    "camera",
+    "curriculum",
+    "delay.native_ms",
+    "delay.transport_ms",
+    "delay.link_ms",
+    "randomisation.estimation",
+    "randomisation.extra_delay_ms",
+)
+"""Fields of an `EnvironmentSpec` that only the batch twin flies by."""
+
+
+def scenario_of(spec: EnvironmentSpec, beside: Mapping[str, Any]) -> Scenario:
+    """Return the scenario; who decides is left open.
+
+    Args:
+        spec: The environment.
+        beside: Of the fields `BESIDE` those that are not to be as by default.
+
+    Raises:
+        FieldError: A field is of the wrong type or out of range, or only the twin has it.
+    """
+    usual = EnvironmentSpec()
+    for name in TWIN_ALONE:
+        value, accepted = (reduce(getattr, name.split("."), each) for each in (spec, usual))
+        if value != accepted:
+            raise FieldError(name, value, f"{accepted}: only the batch twin has another")
+    if len(spec.delay.latency) > 1:
+        raise FieldError("delay.latency", spec.delay.latency, "one source, of all episodes")
+    rules, delay, drawn = spec.episode, spec.delay, spec.randomisation
+    return Scenario(
+        level="lockstep",
+        vehicle=spec.vehicle,
+        arena=spec.arena,
+        hold_s=rules.hold_s,
+        altitude_m=rules.altitude_m,
+        goal_radius_m=rules.goal_radius_m,
+        time_limit_s=rules.time_limit_s,
+        max_speed_m_s=spec.max_speed_m_s,
+        decisions=spec.decisions,
+        compensate=spec.compensate,
+        watchdog=WatchdogSettings(
+            hover_after_s=rules.hover_after_s, decision_timeout_s=rules.decision_timeout_s
+        ),
+        computer=delay.computer,
+        workload=delay.workload,
+        latency=delay.latency[0] if delay.latency else None,
+        wind=spec.wind,
+        spread={name: getattr(drawn, name) for name in Spread.model_fields},
+        sensors={name: getattr(drawn, name) for name in SensorNoise.model_fields},
+        **beside,
+    )

@@ -1,0 +1,242 @@
+"""`airl/Rehearsal-v0`: a Gymnasium loop flies what a rehearsal flies.
+
+AIRL_PX4_DIR, as of test_lockstep_px4.py, lets a real PX4 fly here as well.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from stable_baselines3.common.env_checker import check_env as check_env_for_sb3
+
+from airl_mav.core.errors import UsageError
+from airl_mav.envs.decisions import FIRST_TRAINING_SEED
+from airl_mav.envs.registration import NAVIGATION, REHEARSAL
+from airl_mav.lockstep.flight import fly
+from airl_mav.lockstep.gym_env import RehearsalEnv
+from airl_mav.policy.learned import LearnedPolicy
+from airl_mav.rehearsal.run_folder import FlownEpisode
+from airl_mav.scenario.model import Scenario
+from airl_mav.scenario.resolve import resolve
+from firmware_sim.flight_controller import FirmwareLostError
+from tests.flight.test_lockstep_px4 import REAL
+from tests.support.processes import write_arena
+from tests.support.px4_peer import write_build
+
+AHEAD = 2
+"""An action of arc-25 that flies straight on."""
+
+
+def knobs_of(scenario: Scenario) -> tuple[LearnedPolicy, dict[str, Any]]:
+    """Return a scenario's policy, and the environment that it was trained for."""
+    policy = resolve(scenario).fresh_policy(scenario.seed)
+    assert isinstance(policy, LearnedPolicy)
+    card = policy.card
+    return policy, {
+        "arena": scenario.arena,
+        "image_width_px": card.observation.width_px,
+        "image_height_px": card.observation.height_px,
+        "frames": card.observation.frames,
+        "in_flight": card.observation.in_flight,
+        "actions": card.actions.set,
+        "max_speed_m_s": card.actions.max_speed_m_s,
+        "decisions": card.decisions,
+        "episode": {
+            "goal_radius_m": card.goal_radius_m,
+            "hold_s": card.hold_s,
+            "altitude_m": card.altitude_m,
+            "hover_after_s": card.hover_after_s,
+            "time_limit_s": scenario.time_limit_s,
+        },
+    }
+
+
+def flown_by(
+    policy: LearnedPolicy, env: gym.Env[Any, Any], seed: int
+) -> tuple[int, float, dict[str, Any]]:
+    """Fly an episode; return its number of decisions, its return and the last info."""
+    seen, _ = env.reset(seed=seed)
+    decisions, total, ended = 0, 0.0, False
+    while not ended:
+        action = policy.act_batch({key: value[None] for key, value in seen.items()})[0]
+        seen, reward, terminated, truncated, info = env.step(action)
+        decisions, total = decisions + 1, total + float(reward)
+        ended = terminated or truncated
+    return decisions, total, info
+
+
+def last_flown(env: gym.Env[Any, Any]) -> FlownEpisode:
+    assert isinstance(env.unwrapped, RehearsalEnv)
+    assert env.unwrapped.flown is not None
+    return env.unwrapped.flown
+
+
+@contextmanager
+def made(**knobs: Any) -> Iterator[gym.Env[Any, Any]]:
+    env = gym.make(REHEARSAL, **knobs)
+    try:
+        yield env
+    finally:
+        env.close()
+
+
+@pytest.mark.parametrize(
+    ("policy", "arena"),
+    [("static-obstacles-fast", "static-obstacles"), ("body-rates", "no-obstacles")],
+)
+def test_a_loop_flies_what_the_rehearsal_flies(policy: str, arena: str) -> None:
+    """To the tick; and its return is nearly that of the batch twin."""
+    scenario = Scenario(policy=policy, arena=arena, level="lockstep", episodes=1, seed=3)
+    network, knobs = knobs_of(scenario)
+    resolved = resolve(scenario)
+    flown = fly(resolved, resolved.fresh_policy(3), 0, 3)
+    record = flown.record
+    assert record.quality is not None
+    with made(**knobs) as env:
+        decisions, total, info = flown_by(network, env, 3)
+        again = last_flown(env)
+    same = flown.trajectory.time_us <= record.ended_us
+    np.testing.assert_array_equal(
+        again.trajectory.position[: same.sum()], flown.trajectory.position[same]
+    )
+    assert again.record.outcome is record.outcome
+    assert (again.record.navigation_us, again.record.ended_us) == (
+        record.navigation_us,
+        record.ended_us,
+    )
+    twin = gym.make(NAVIGATION, **knobs)
+    assert twin.observation_space == env.observation_space
+    assert twin.action_space == env.action_space
+    in_twin, total_there, info_there = flown_by(network, twin, 3)
+    assert info.keys() == info_there.keys()
+    assert info["outcome"] == record.outcome.value == info_there["outcome"] == "success"
+    assert (info["seed"], info["zone"], info["success"]) == (3, -1, True)
+    assert info["flight_time_s"] == pytest.approx(record.quality.flight_time_s, abs=1e-9)
+    # The record's path is sampled at 50 Hz.
+    assert info["distance_m"] == pytest.approx(record.quality.distance_m, abs=2e-3)
+    assert info["energy_j"] == pytest.approx(record.quality.energy_j, rel=1e-4)
+    assert abs(decisions - in_twin) <= 0.06 * in_twin
+    assert total == pytest.approx(total_there, rel=0.05)
+
+
+def test_both_checkers_are_content() -> None:
+    env = gym.make(REHEARSAL, arena="no-obstacles", episode={"time_limit_s": 3.0}).unwrapped
+    check_env(env, skip_render_check=True)
+    check_env_for_sb3(env)
+    env.close()
+
+
+def test_episodes_one_after_the_other_as_in_the_batch_twin() -> None:
+    knobs: dict[str, Any] = {"arena": "no-obstacles", "episode": {"time_limit_s": 1.0}}
+    twin = gym.make(NAVIGATION, **knobs)
+    threads = threading.active_count()
+    with made(**knobs) as env:
+        with pytest.raises(gym.error.ResetNeeded):
+            env.unwrapped.step(AHEAD)
+        for seed in (5, None):
+            (_, info), (_, there) = env.reset(seed=seed), twin.reset(seed=seed)
+            assert info["seed"] == there["seed"]
+            assert info["goal_distance_m"] == pytest.approx(there["goal_distance_m"], abs=0.5)
+        assert info["seed"] >= FIRST_TRAINING_SEED
+        env.reset(seed=5, options={"zone": 0})
+        assert env.reset()[1]["zone"] == 0, "until a reset with a seed or options"
+        assert env.reset(seed=5)[1]["zone"] == -1
+        env.step(AHEAD)
+        *_, truncated, info = env.step(AHEAD)
+        assert (truncated, info["outcome"]) == (True, "timeout")
+        assert info["flight_time_s"] == pytest.approx(1.0, abs=0.005)
+        with pytest.raises(gym.error.ResetNeeded):
+            env.unwrapped.step(AHEAD)
+        # And in the middle of a flight.
+        env.reset(seed=5)
+    assert threading.active_count() == threads
+    with pytest.raises(gym.error.ResetNeeded):
+        env.unwrapped.step(AHEAD)
+
+
+def test_what_ends_an_episode(tmp_path: Path) -> None:
+    """A wall is a failure; that the companion flies no further is neither success nor failure."""
+    arena = str(write_arena(tmp_path, 40.0))
+    with made(arena=arena, actions="velocity", limits={"radius_m": 4.0}) as env:
+        env.reset(seed=1)
+        terminated = truncated = False
+        while not (terminated or truncated):
+            *_, terminated, truncated, info = env.step(np.array([1.0, 0.0], np.float32))
+        assert (terminated, truncated, info["success"]) == (False, True, False)
+        assert info["outcome"] == "aborted"
+        assert last_flown(env).record.reason == "out of bounds"
+    with made(arena=arena, actions="body-rates", decisions="pipelined") as env:
+        env.reset(seed=1)
+        total = 0.0
+        terminated = truncated = False
+        while not (terminated or truncated):
+            _, reward, terminated, truncated, info = env.step(np.array([0, 0, 0, -1], np.float32))
+            total += float(reward)
+        assert (terminated, info["outcome"]) == (True, "collision")
+        assert total < -0.5, "it has fallen"
+
+
+@pytest.mark.parametrize(
+    ("knobs", "message"),
+    [
+        ({"firmwares": "px4"}, "unexpected keyword argument 'firmwares'"),
+        ({"firmware": "px5"}, "firmware 'px5': accepted: .*'px4'"),
+        ({"firmware": "ardupilot"}, "firmware"),
+        ({"render_mode": "human"}, "render_mode = 'human': accepted: None"),
+        ({"curriculum": {}}, "curriculum .*: accepted: None: only the batch twin has another"),
+        ({"delay": {"link_ms": 9}}, r"delay\.link_ms 9: accepted: 4"),
+        ({"delay": {"latency": ["9ms", "8ms"]}}, "delay.latency .*: accepted: one source"),
+        ({"goal_height": True}, "goal_height True: accepted: false in arena"),
+        ({"faults": ["gps off at noon"]}, "faults"),
+    ],
+)
+def test_a_wrong_knob_gets_one_clear_line(knobs: dict[str, Any], message: str) -> None:
+    with pytest.raises(UsageError, match=message) as caught:
+        RehearsalEnv(**knobs)
+    assert "\n" not in str(caught.value)
+
+
+# --- PX4
+
+
+@pytest.mark.slow
+def test_a_loop_with_px4_s_stand_in(tmp_path: Path, px4_instance: int) -> None:
+    real = {"px4_dir": str(write_build(tmp_path / "px4")), "instance": px4_instance}
+    arena = str(write_arena(tmp_path, 10.0))
+    with made(arena=arena, actions="velocity", firmware="px4", real=real) as env:
+        for seed in (1, 2):
+            env.reset(seed=seed)
+            env.step(np.zeros(2, np.float32))
+        *_, info = env.step(np.array([1.0, 0.0], np.float32))
+        assert info["flight_time_s"] > 0.5
+
+
+@pytest.mark.slow
+def test_a_loop_that_loses_its_firmware(tmp_path: Path, px4_instance: int) -> None:
+    build = write_build(tmp_path / "px4", "--fault", "die@1")
+    real = {"px4_dir": str(build), "instance": px4_instance}
+    with made(arena=str(write_arena(tmp_path, 10.0)), firmware="px4", real=real) as env:
+        for _ in range(2):  # It can be tried again.
+            with pytest.raises(FirmwareLostError, match="PX4"):
+                env.reset(seed=1)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(REAL is None, reason="AIRL_PX4_DIR names no PX4")
+def test_a_loop_with_real_px4(px4_instance: int) -> None:
+    scenario = Scenario(policy="body-rates", arena="no-obstacles", level="lockstep", episodes=1)
+    network, knobs = knobs_of(scenario)
+    real = {"px4_dir": REAL, "instance": px4_instance}
+    with made(**knobs, firmware="px4", real=real) as env:
+        _, _, info = flown_by(network, env, 3)
+    _, _, built_in = flown_by(network, gym.make(REHEARSAL, **knobs), 3)
+    assert info["outcome"] == built_in["outcome"] == "success"
+    assert info["flight_time_s"] == pytest.approx(built_in["flight_time_s"], rel=0.1)
