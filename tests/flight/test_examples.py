@@ -71,6 +71,15 @@ def test_own_policy(tmp_path: Path) -> None:
     assert len(re.findall(r"^seed \d: (success|collision|timeout), ", text, re.M)) == 2
 
 
+def test_gymnasium_px4(tmp_path: Path) -> None:
+    """Learned in the twin, it flies there as in lockstep."""
+    text = output_of("gymnasium_px4.py", tmp_path)
+    pattern = r"^{}, seed \d: success after ([\d.]+) s and [\d.]+ m$"
+    in_twin, built_in = (numbers_after(pattern.format(who), text) for who in ("twin", "built-in"))
+    assert len(in_twin) == len(built_in) == 3, text
+    np.testing.assert_allclose(built_in, in_twin, rtol=0.1)
+
+
 def test_own_body_rates(tmp_path: Path) -> None:
     """They need decisions in time, where velocities would hardly lose anything."""
     text = output_of("own_body_rates.py", tmp_path)
