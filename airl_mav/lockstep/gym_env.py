@@ -120,7 +120,7 @@ class RehearsalEnv(gym.Env[Encoded, Any]):
         self._newest = self._encode(asked)
         self._before = flight.flights()
         self._last = np.zeros((1, 4 if self.environment.actions == "body-rates" else 3))
-        return self._newest, self._info(self._before)
+        return self._seen(), self._info(self._before)
 
     def step(self, action: Any) -> tuple[Encoded, float, bool, bool, dict[str, Any]]:
         """Fly one decision; see Gymnasium's Env.step.
@@ -145,8 +145,6 @@ class RehearsalEnv(gym.Env[Encoded, Any]):
         self._before, self._last = now, level
         if isinstance(asked, Observation):
             self._newest = self._encode(asked)
-        else:
-            self._newest = {key: array.copy() for key, array in self._newest.items()}
         info = self._info(now)
         if outcome is not None:
             info |= {"success": outcome is Outcome.SUCCESS, "outcome": outcome.value}
@@ -154,7 +152,7 @@ class RehearsalEnv(gym.Env[Encoded, Any]):
             self.close()
         truncated = outcome in (Outcome.TIMEOUT, Outcome.ABORTED)
         terminated = outcome is not None and not truncated
-        return self._newest, float(reward[0]), terminated, truncated, info
+        return self._seen(), float(reward[0]), terminated, truncated, info
 
     def close(self) -> None:
         """End the flight, if there is one."""
@@ -172,6 +170,10 @@ class RehearsalEnv(gym.Env[Encoded, Any]):
 
     def _encode(self, asked: Observation) -> Encoded:
         return {key: rows[0] for key, rows in encode_layout(self._sees, asked.rows(None)).items()}
+
+    def _seen(self) -> Encoded:
+        """Return the newest observation; whoever takes it may change it."""
+        return {key: array.copy() for key, array in self._newest.items()}
 
     def _info(self, now: Flights) -> dict[str, Any]:
         zone = self._resolved.scenario.zone
