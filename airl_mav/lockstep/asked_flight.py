@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from queue import SimpleQueue
-from threading import Thread
+from contextlib import suppress
+from queue import Empty, SimpleQueue
+from threading import Thread, main_thread
 
 import numpy as np
 
@@ -38,8 +39,12 @@ IDLE: dict[CommandKind, AnyAction] = {
 """What a flight that is called off is answered with; it is not sent any more."""
 
 
+LEAVING_S = 0.2
+"""A flight that waits for a decision looks so often whether the program is about to end [wall s]."""
+
+
 class AskedFlight:
-    """A flight on a thread of its own, which waits for every decision.
+    """A flight on a thread of its own, which waits for every decision, or for the program's end.
 
     Implements `actions.Policy` for the companion. All other methods are for one other thread; they
     return while the flight waits, so that its state stands.
@@ -55,13 +60,18 @@ class AskedFlight:
             resolved, self, 0, seed, patience_s=math.inf, ticked=self._account.ticked
         )
         self._end: FlownEpisode | BaseException | None = None
-        self._thread = Thread(target=self._fly, name="rehearsal", daemon=True)
+        # Not a daemon: MAVSDK is no longer there when those are ended.
+        self._thread = Thread(target=self._fly, name="rehearsal")
         self._thread.start()
 
     def act(self, observation: Observation) -> AnyAction:
         """Ask for a decision, on the companion's thread."""
         self._events.put(observation)
-        return self._answers.get()
+        while main_thread().is_alive():
+            with suppress(Empty):
+                return self._answers.get(timeout=LEAVING_S)
+        self._flight.call_off()
+        return self._idle
 
     def asked(self) -> Observation | FlownEpisode:
         """Return what the next decision is to be made on, or the flight when it is over.

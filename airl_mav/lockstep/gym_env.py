@@ -114,6 +114,7 @@ class RehearsalEnv(gym.Env[Encoded, Any]):
         self._seed = draw_seeds(self.np_random, 1)[0] if seed is None else episode_seed(seed)
         flight = AskedFlight(self._resolved, self._seed, self._resolved.arena_of(self._seed))
         self._flight, self._ending = flight, weakref.finalize(self, flight.end)
+        self._ending.atexit = False  # The flight sees to that itself.
         asked = self._heard(flight.asked)
         if isinstance(asked, FlownEpisode):
             raise gym.error.Error(f"seed {self._seed}: it has not taken off: {asked.record.reason}")

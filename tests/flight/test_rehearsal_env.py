@@ -5,6 +5,8 @@ AIRL_PX4_DIR, as of test_lockstep_px4.py, lets a real PX4 fly here as well.
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -204,6 +206,38 @@ def test_a_wrong_knob_gets_one_clear_line(knobs: dict[str, Any], message: str) -
     with pytest.raises(UsageError, match=message) as caught:
         RehearsalEnv(**knobs)
     assert "\n" not in str(caught.value)
+
+
+LEAVES = """
+import gc, sys, threading
+import gymnasium
+def make():
+    env = gymnasium.make("airl_mav:airl/Rehearsal-v0", arena="no-obstacles")
+    env.reset(seed=1)
+    return env
+if sys.argv[1] == "dropped":
+    env = make()
+    del env
+    gc.collect()
+    assert threading.active_count() == 1
+env = make()
+if sys.argv[1] == "error":
+    raise ValueError("of the learner")
+"""
+"""A program that never closes its environment."""
+
+
+@pytest.mark.parametrize(("how", "status"), [("dropped", 0), ("error", 1)])
+def test_a_program_may_end_in_the_middle_of_a_flight(how: str, status: int) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", LEAVES, how],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert (done.returncode, done.stdout) == (status, ""), done.stderr
+    assert ("ValueError: of the learner" in done.stderr) == (how == "error")
 
 
 # --- PX4
