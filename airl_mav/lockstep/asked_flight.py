@@ -40,7 +40,7 @@ IDLE: dict[CommandKind, AnyAction] = {
 
 
 LEAVING_S = 0.2
-"""A flight that waits for a decision looks so often whether the program is about to end [wall s]."""
+"""A flight that waits for a decision looks so often whether the program ends [wall s]."""
 
 
 class AskedFlight:
