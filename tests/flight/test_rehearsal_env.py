@@ -22,10 +22,11 @@ from stable_baselines3.common.env_checker import check_env as check_env_for_sb3
 from airl_mav.core.errors import UsageError
 from airl_mav.envs.decisions import FIRST_TRAINING_SEED
 from airl_mav.envs.registration import NAVIGATION, REHEARSAL
+from airl_mav.envs.single import NavigationEnv
+from airl_mav.experiments.gym_flier import environment_of
 from airl_mav.lockstep.flight import fly
 from airl_mav.lockstep.gym_env import RehearsalEnv
 from airl_mav.policy.learned import LearnedPolicy
-from airl_mav.rehearsal.run_folder import FlownEpisode
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 from firmware_sim.flight_controller import FirmwareLostError
@@ -35,30 +36,6 @@ from tests.support.px4_peer import write_build
 
 AHEAD = 2
 """An action of arc-25 that flies straight on."""
-
-
-def knobs_of(scenario: Scenario) -> tuple[LearnedPolicy, dict[str, Any]]:
-    """Return a scenario's policy, and the environment that it was trained for."""
-    policy = resolve(scenario).fresh_policy(scenario.seed)
-    assert isinstance(policy, LearnedPolicy)
-    card = policy.card
-    return policy, {
-        "arena": scenario.arena,
-        "image_width_px": card.observation.width_px,
-        "image_height_px": card.observation.height_px,
-        "frames": card.observation.frames,
-        "in_flight": card.observation.in_flight,
-        "actions": card.actions.set,
-        "max_speed_m_s": card.actions.max_speed_m_s,
-        "decisions": card.decisions,
-        "episode": {
-            "goal_radius_m": card.goal_radius_m,
-            "hold_s": card.hold_s,
-            "altitude_m": card.altitude_m,
-            "hover_after_s": card.hover_after_s,
-            "time_limit_s": scenario.time_limit_s,
-        },
-    }
 
 
 def flown_by(
@@ -73,12 +50,6 @@ def flown_by(
         decisions, total = decisions + 1, total + float(reward)
         ended = terminated or truncated
     return decisions, total, info
-
-
-def last_flown(env: gym.Env[Any, Any]) -> FlownEpisode:
-    assert isinstance(env.unwrapped, RehearsalEnv)
-    assert env.unwrapped.flown is not None
-    return env.unwrapped.flown
 
 
 @contextmanager
@@ -97,14 +68,16 @@ def made(**knobs: Any) -> Iterator[gym.Env[Any, Any]]:
 def test_a_loop_flies_what_the_rehearsal_flies(policy: str, arena: str) -> None:
     """To the tick; and its return is nearly that of the batch twin."""
     scenario = Scenario(policy=policy, arena=arena, level="lockstep", episodes=1, seed=3)
-    network, knobs = knobs_of(scenario)
     resolved = resolve(scenario)
+    network, spec = resolved.fresh_policy(3), environment_of(resolved)
+    assert isinstance(network, LearnedPolicy)
     flown = fly(resolved, resolved.fresh_policy(3), 0, 3)
     record = flown.record
     assert record.quality is not None
-    with made(**knobs) as env:
-        decisions, total, info = flown_by(network, env, 3)
-        again = last_flown(env)
+    env, twin = RehearsalEnv(spec), NavigationEnv(spec)
+    decisions, total, info = flown_by(network, env, 3)
+    again = env.flown
+    assert again is not None
     same = flown.trajectory.time_us <= record.ended_us
     np.testing.assert_array_equal(
         again.trajectory.position[: same.sum()], flown.trajectory.position[same]
@@ -114,7 +87,6 @@ def test_a_loop_flies_what_the_rehearsal_flies(policy: str, arena: str) -> None:
         record.navigation_us,
         record.ended_us,
     )
-    twin = gym.make(NAVIGATION, **knobs)
     assert twin.observation_space == env.observation_space
     assert twin.action_space == env.action_space
     in_twin, total_there, info_there = flown_by(network, twin, 3)
@@ -176,7 +148,9 @@ def test_what_ends_an_episode(tmp_path: Path) -> None:
             *_, terminated, truncated, info = env.step(np.array([1.0, 0.0], np.float32))
         assert (terminated, truncated, info["success"]) == (False, True, False)
         assert info["outcome"] == "aborted"
-        assert last_flown(env).record.reason == "out of bounds"
+        assert isinstance(env.unwrapped, RehearsalEnv)
+        assert env.unwrapped.flown is not None
+        assert env.unwrapped.flown.record.reason == "out of bounds"
     with made(arena=arena, actions="body-rates", decisions="pipelined") as env:
         env.reset(seed=1)
         total = 0.0
@@ -269,10 +243,11 @@ def test_a_loop_that_loses_its_firmware(tmp_path: Path, px4_instance: int) -> No
 @pytest.mark.skipif(REAL is None, reason="AIRL_PX4_DIR names no PX4")
 def test_a_loop_with_real_px4(px4_instance: int) -> None:
     scenario = Scenario(policy="body-rates", arena="no-obstacles", level="lockstep", episodes=1)
-    network, knobs = knobs_of(scenario)
+    resolved = resolve(scenario)
+    network, spec = resolved.fresh_policy(3), environment_of(resolved)
+    assert isinstance(network, LearnedPolicy)
     real = {"px4_dir": REAL, "instance": px4_instance}
-    with made(**knobs, firmware="px4", real=real) as env:
-        _, _, info = flown_by(network, env, 3)
-    _, _, built_in = flown_by(network, gym.make(REHEARSAL, **knobs), 3)
+    _, _, info = flown_by(network, RehearsalEnv(spec, firmware="px4", real=real), 3)
+    _, _, built_in = flown_by(network, RehearsalEnv(spec), 3)
     assert info["outcome"] == built_in["outcome"] == "success"
     assert info["flight_time_s"] == pytest.approx(built_in["flight_time_s"], rel=0.1)
