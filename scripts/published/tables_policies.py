@@ -32,6 +32,7 @@ SHIPPED: dict[str, tuple[str, str]] = {
     "gates": ("gates", "run"),
     "body-rates": ("body-rates-gap", "no-obstacles-reference"),
     "body-rates-120ms": ("body-rates-gap", "no-obstacles-mitigated"),
+    "body-rates-hall": ("body-rates-hall", "run"),
 }
 """Where the flights of each policy stand: in its own arena, as late as in its training."""
 
