@@ -162,10 +162,10 @@ class RehearsalEnv(gym.Env[Encoded, Any]):
         self._flight = self._ending = None
 
     def _heard(self, ask: Callable[[], Observation | FlownEpisode]) -> Observation | FlownEpisode:
-        """Return what the flight asks, or the flight; it is over where it raises, too."""
+        """Return what the flight asks, or the flight; it is over where that fails, too."""
         try:
             return ask()
-        except Exception:
+        except BaseException:  # Ctrl-C, too: what the flight asks next would be taken for this.
             self.close()
             raise
 

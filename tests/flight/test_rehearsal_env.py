@@ -5,6 +5,7 @@ AIRL_PX4_DIR, as of test_lockstep_px4.py, lets a real PX4 fly here as well.
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
 import threading
@@ -24,6 +25,7 @@ from airl_mav.envs.decisions import FIRST_TRAINING_SEED
 from airl_mav.envs.registration import NAVIGATION, REHEARSAL
 from airl_mav.envs.single import NavigationEnv
 from airl_mav.experiments.gym_flier import environment_of
+from airl_mav.lockstep.asked_flight import AskedFlight
 from airl_mav.lockstep.flight import fly
 from airl_mav.lockstep.gym_env import RehearsalEnv
 from airl_mav.policy.learned import LearnedPolicy
@@ -36,6 +38,14 @@ from tests.support.px4_peer import write_build
 
 AHEAD = 2
 """An action of arc-25 that flies straight on."""
+
+ASKED = AskedFlight.asked
+
+
+def slowly(flight: AskedFlight) -> Any:
+    """Stand in for `AskedFlight.asked`: what comes is waited for longer."""
+    threading.Event().wait(30.0)
+    return ASKED(flight)
 
 
 def flown_by(
@@ -180,6 +190,28 @@ def test_a_wrong_knob_gets_one_clear_line(knobs: dict[str, Any], message: str) -
     with pytest.raises(UsageError, match=message) as caught:
         RehearsalEnv(**knobs)
     assert "\n" not in str(caught.value)
+
+
+def test_ctrl_c_ends_the_flight_and_the_next_one_begins(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with made(arena="no-obstacles") as env:
+        began = env.reset(seed=2)[1], env.step(AHEAD)[-1]
+        before = signal.signal(signal.SIGALRM, interrupt)
+        try:
+            for act in (lambda: env.step(AHEAD), lambda: env.reset(seed=2)):
+                # As soon as the learner waits for what has been asked.
+                monkeypatch.setattr(AskedFlight, "asked", slowly)
+                signal.setitimer(signal.ITIMER_REAL, 0.1)
+                with pytest.raises(KeyboardInterrupt):
+                    act()
+                monkeypatch.undo()
+                with pytest.raises(gym.error.ResetNeeded):
+                    env.step(AHEAD)
+                assert (env.reset(seed=2)[1], env.step(AHEAD)[-1]) == began
+        finally:
+            signal.signal(signal.SIGALRM, before)
 
 
 LEAVES = """
