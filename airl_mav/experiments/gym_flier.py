@@ -55,8 +55,10 @@ def environment_of(scenario: ResolvedScenario) -> EnvironmentSpec:
             "image_height_px": card.observation.height_px,
             "frames": card.observation.frames,
             "in_flight": card.observation.in_flight,
+            "goal_height": card.observation.goal_height,
             "actions": card.actions.set,
             "max_speed_m_s": card.actions.max_speed_m_s,
+            "max_rate_deg_s": card.actions.max_rate_deg_s,
             "cameras": {
                 name: {
                     "image_width_px": seen.width_px,

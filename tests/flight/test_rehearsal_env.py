@@ -72,12 +72,18 @@ def made(**knobs: Any) -> Iterator[gym.Env[Any, Any]]:
 
 
 @pytest.mark.parametrize(
-    ("policy", "arena"),
-    [("static-obstacles-fast", "static-obstacles"), ("body-rates", "no-obstacles")],
+    ("policy", "arena", "asked"),
+    [
+        ("static-obstacles-fast", "static-obstacles", {"wind": {"north_m_s": 2.0}}),
+        ("body-rates", "no-obstacles", {}),
+        ("gates", "gates", {"latency": "90ms", "compensate": True}),
+    ],
 )
-def test_a_loop_flies_what_the_rehearsal_flies(policy: str, arena: str) -> None:
-    """To the tick; and its return is nearly that of the batch twin."""
-    scenario = Scenario(policy=policy, arena=arena, level="lockstep", episodes=1, seed=3)
+def test_a_loop_flies_what_the_rehearsal_flies(
+    policy: str, arena: str, asked: dict[str, Any]
+) -> None:
+    """To the last bit; and its return is nearly that of the batch twin."""
+    scenario = Scenario(policy=policy, arena=arena, level="lockstep", episodes=1, seed=3, **asked)
     resolved = resolve(scenario)
     network, spec = resolved.fresh_policy(3), environment_of(resolved)
     assert isinstance(network, LearnedPolicy)
