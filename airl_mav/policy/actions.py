@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.core.constants import CommandKind
+from airl_mav.core.constants import GRAVITY_M_S2, CommandKind
 from airl_mav.core.errors import FieldError
 from airl_mav.policy.observation import Observation
 
@@ -42,6 +42,34 @@ class Attitude(NamedTuple):
     """Heading, 0 = north, positive to the east."""
     thrust: float
     """Collective, 0 to 1 of what the motors can; what hovers is MPC_THR_HOVER of PX4."""
+
+    @classmethod
+    def accelerating(
+        cls,
+        forward_m_s2: float,
+        right_m_s2: float,
+        down_m_s2: float,
+        *,
+        yaw_rad: float,
+        hover_thrust: float = 0.5,
+    ) -> Attitude:
+        """Return what accelerates a vehicle so: for policies that command accelerations.
+
+        Thrust alone makes the specific force a - g, as in PX4's ControlMath::bodyzToAttitude; drag
+        is left to the policy. A tilt is not limited.
+
+        Args:
+            forward_m_s2: Level, along the heading that is commanded [m/s²].
+            right_m_s2: Level, to the right of it [m/s²].
+            down_m_s2: Downward [m/s²]; 0 holds the vertical speed.
+            yaw_rad: That heading, 0 = north, positive to the east.
+            hover_thrust: MPC_THR_HOVER of the vehicle.
+        """
+        up_m_s2 = GRAVITY_M_S2 - down_m_s2
+        force_m_s2 = math.hypot(forward_m_s2, right_m_s2, up_m_s2)
+        roll = math.asin(right_m_s2 / force_m_s2) if force_m_s2 > 0.0 else 0.0
+        thrust = hover_thrust * force_m_s2 / GRAVITY_M_S2
+        return cls(roll, -math.atan2(forward_m_s2, up_m_s2), yaw_rad, thrust)
 
 
 class BodyRates(NamedTuple):

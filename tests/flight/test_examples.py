@@ -80,6 +80,12 @@ def test_gymnasium_px4(tmp_path: Path) -> None:
     np.testing.assert_allclose(built_in, in_twin, rtol=0.1)
 
 
+def test_own_acceleration(tmp_path: Path) -> None:
+    text = output_of("own_acceleration.py", tmp_path)
+    times_s = numbers_after(r"^seed \d: success after ([\d.]+) s$", text)
+    assert len(times_s) == 3, text
+
+
 def test_own_body_rates(tmp_path: Path) -> None:
     """They need decisions in time, where velocities would hardly lose anything."""
     text = output_of("own_body_rates.py", tmp_path)

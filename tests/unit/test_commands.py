@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.control.attitude import attitude_setpoint
 from airl_mav.core.clock import SimClock
-from airl_mav.core.constants import CommandKind
+from airl_mav.core.constants import GRAVITY_M_S2, CommandKind
 from airl_mav.core.errors import FieldError
 from airl_mav.core.frames import down_in_body
 from airl_mav.latency.stamps import SETPOINTS, DecisionLog, commanded, setpoint_column
@@ -277,3 +278,21 @@ def test_an_overdue_turn_or_lean_is_ended_before_the_stop(
     clock.advance(100_000)
     watchdog.look()
     assert len(link.sent) == 2 + len(before), "once"
+
+
+@given(*(st.floats(-8.0, 8.0) for _ in range(3)), st.floats(-3.1, 3.1), st.floats(0.2, 0.7))
+def test_an_attitude_accelerates_as_it_is_asked_to(
+    forward: float, right: float, down: float, yaw: float, hover: float
+) -> None:
+    """By scipy's rotations, and by the PX4 mathematics that the flight controllers here fly."""
+    asked = np.array([forward, right, down])
+    made = Attitude.accelerating(*asked, yaw_rad=yaw, hover_thrust=hover)
+    body = Rotation.from_euler("ZYX", [made.yaw_rad, made.pitch_rad, made.roll_rad])
+    gravity = np.array([0.0, 0.0, GRAVITY_M_S2])
+    flown = body.apply(-gravity * made.thrust / hover) + gravity
+    heading = Rotation.from_euler("Z", yaw)
+    np.testing.assert_allclose(heading.inv().apply(flown), asked, atol=1e-9)
+    thrust = heading.apply(asked) - gravity
+    px4 = attitude_setpoint(tuple(thrust), math.cos(yaw), math.sin(yaw))
+    theirs = Rotation.from_quat(px4, scalar_first=True)
+    assert (body.inv() * theirs).magnitude() < 1e-6
