@@ -55,6 +55,13 @@ class DrawnAhead(Stateful):
                 self._draw_block(i)
 
 
+def source_of(injections: Sequence[Injection], seed: int) -> Injection:
+    """Return the source of t2, of one or more, that the episode of a seed has drawn."""
+    if len(injections) == 1:
+        return injections[0]
+    return injections[int(stream(seed, Stream.SOURCE).integers(len(injections)))]
+
+
 class DelayDraws(DrawnAhead):
     """t2 of every decision of n episodes [µs]."""
 
@@ -78,10 +85,7 @@ class DelayDraws(DrawnAhead):
 
     def begin(self, i: int, seed: int) -> None:
         """Start the episode of slot i. The companion draws the same latencies from this seed."""
-        injection = self._injections[0]
-        if len(self._injections) > 1:
-            chosen = stream(seed, Stream.SOURCE).integers(len(self._injections))
-            injection = self._injections[int(chosen)]
+        injection = source_of(self._injections, seed)
         self._seeds[i], self._blocks[i] = seed, 0
         # A generator that nothing is drawn from takes its time all the same.
         self._samplers[i] = (

@@ -19,7 +19,8 @@ from airl_mav.envs.decisions import (
     observation_space,
     zone_option,
 )
-from airl_mav.envs.delay import bounded
+from airl_mav.envs.delay import bounded, injections_of
+from airl_mav.envs.draws import source_of
 from airl_mav.envs.navigation import Flights
 from airl_mav.envs.rewards import Step, costs, reward_of
 from airl_mav.envs.sight import sight_of
@@ -82,6 +83,7 @@ class RehearsalEnv(gym.Env[Encoded, Any]):
         if self._sees.goal_height and flat:
             accepted = f"false in arena {self.environment.arena!r}, whose goals have none"
             raise FieldError("goal_height", True, accepted)
+        self._sources = injections_of(self.environment.delay)
         warm_up(self._resolved.vehicle, self._resolved.scenario.plant)
         self.observation_space: gym.Space[Any] = observation_space(self._sees)
         self.action_space = action_space(actions)
@@ -112,7 +114,10 @@ class RehearsalEnv(gym.Env[Encoded, Any]):
             self._resolved = replace(self._resolved, scenario=scenario)
         super().reset(seed=seed)
         self._seed = draw_seeds(self.np_random, 1)[0] if seed is None else episode_seed(seed)
-        flight = AskedFlight(self._resolved, self._seed, self._resolved.arena_of(self._seed))
+        resolved = self._resolved
+        if len(self._sources) > 1:
+            resolved = replace(resolved, injection=source_of(self._sources, self._seed))
+        flight = AskedFlight(resolved, self._seed, resolved.arena_of(self._seed))
         self._flight, self._ending = flight, weakref.finalize(self, flight.end)
         self._ending.atexit = False  # The flight sees to that itself.
         asked = self._heard(flight.asked)

@@ -41,7 +41,7 @@ TWIN_ALONE = (
 
 
 def scenario_of(spec: EnvironmentSpec, beside: Mapping[str, Any]) -> Scenario:
-    """Return the scenario; who decides is left open.
+    """Return the scenario; who decides is left open, and of which of several sources t2 is.
 
     Args:
         spec: The environment.
@@ -55,8 +55,6 @@ def scenario_of(spec: EnvironmentSpec, beside: Mapping[str, Any]) -> Scenario:
         value, accepted = (reduce(getattr, name.split("."), each) for each in (spec, usual))
         if value != accepted:
             raise FieldError(name, value, f"{accepted}: only the batch twin has another")
-    if len(spec.delay.latency) > 1:
-        raise FieldError("delay.latency", spec.delay.latency, "one source, of all episodes")
     rules, delay, drawn = spec.episode, spec.delay, spec.randomisation
     return Scenario(
         level="lockstep",
