@@ -16,7 +16,7 @@ import gymnasium
 
 FLIGHTS = 6
 DECISIONS = 20
-AHEAD = 2
+AHEAD = 22
 """The action that flies straight on."""
 
 

@@ -57,7 +57,13 @@ class AskedFlight:
         self._account = _Account(arena)
         self._idle = IDLE[resolved.pilot.commands]
         self._flight = Flight(
-            resolved, self, 0, seed, patience_s=math.inf, ticked=self._account.ticked
+            resolved,
+            self,
+            0,
+            seed,
+            patience_s=math.inf,
+            lands=False,  # What it asks then is how the vehicle stands when the time is up.
+            ticked=self._account.ticked,
         )
         self._end: FlownEpisode | BaseException | None = None
         # Not a daemon: MAVSDK is no longer there when those are ended.

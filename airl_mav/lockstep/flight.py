@@ -14,7 +14,7 @@ import numpy as np
 
 from airl_mav.core.compiling import COMPILING, heard_compiling
 from airl_mav.core.constants import MAX_ATTEMPTS
-from airl_mav.flight.judge import Referee, Verdict
+from airl_mav.flight.judge import Outcome, Referee, Verdict
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.flight.validity import BY_HAND
 from airl_mav.latency.stamps import DecisionLog
@@ -147,6 +147,7 @@ class Flight:
         notes: Sequence[str] = (),
         view: ViewEnds | None = None,
         patience_s: float = PATIENCE_S,
+        lands: bool = True,
         ticked: Callable[[Simulation, Referee, str | None], None] = lambda *_: None,
     ) -> None:
         """Take what is flown, as `fly` does; nothing is made yet.
@@ -160,11 +161,14 @@ class Flight:
             notes: What its record is to say beside its own.
             view: Where it is watched; None: nowhere.
             patience_s: Longest decision of the policy [s of wall time].
+            lands: Whether the companion lands when the time is up; otherwise it goes on until the
+                flight is called off.
             ticked: Called after every tick, with what has been hit so far.
         """
         self._view = view
         self._watched: Watched | None = None
         self._patience_s = patience_s
+        self._lands = lands
         self._ticked = ticked
         self._abandon: threading.Event | None = None
         self._called_off = False
@@ -293,6 +297,9 @@ class Flight:
             self._observer.state(state_of(simulation, self._judge.hit), simulation.start_us)
 
     def _order(self, order: Order) -> None:
+        verdict = self._supervisor.verdict
+        if not self._lands and verdict is not None and verdict.outcome is Outcome.TIMEOUT:
+            return
         if order is Order.ABANDON:
             self._stage.abandon.set()
         self._stop.set()

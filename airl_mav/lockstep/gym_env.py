@@ -49,8 +49,8 @@ class RehearsalEnv(gym.Env[Encoded, Any]):
 
     A flight that is neither judged a success nor a failure (the companion has ended it, say, by one
     of its limits) is truncated; its `outcome` is `aborted`. The observation that an episode ends
-    with is the newest that was asked about: where the vehicle has crashed, or time is up, no other
-    has been made.
+    with is what the next decision would be made on; where none is asked for any more, as after a
+    crash, the newest one.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012

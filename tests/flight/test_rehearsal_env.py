@@ -36,7 +36,7 @@ from tests.flight.test_lockstep_px4 import REAL
 from tests.support.processes import write_arena
 from tests.support.px4_peer import write_build
 
-AHEAD = 2
+AHEAD = 22
 """An action of arc-25 that flies straight on."""
 
 ASKED = AskedFlight.asked
@@ -140,9 +140,13 @@ def test_episodes_one_after_the_other_as_in_the_batch_twin() -> None:
         assert env.reset()[1]["zone"] == 0, "until a reset with a seed or options"
         assert env.reset(seed=5)[1]["zone"] == -1
         seen, *_ = env.step(AHEAD)
+        goal = seen["goal"]
         seen.clear()  # TorchRL puts tensors in the arrays' places.
         last, *_, truncated, info = env.step(AHEAD)
         assert last in env.observation_space
+        assert np.hypot(*(last["goal"] - goal)[:2]) > 0.2, (
+            "it is a new one, of a vehicle that flies"
+        )
         assert (truncated, info["outcome"]) == (True, "timeout")
         assert info["flight_time_s"] == pytest.approx(1.0, abs=0.005)
         with pytest.raises(gym.error.ResetNeeded):
