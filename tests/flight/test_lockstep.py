@@ -367,10 +367,10 @@ def test_bad_input_stays_bad_input() -> None:
         stage.run(setup, refused)
 
 
-def test_a_hanging_companion_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("airl_mav.lockstep.threaded.PATIENCE_S", 1)
+def test_a_hanging_companion_is_told() -> None:
     setup = EpisodeSetup(load_vehicle("quad"), None, 1)
-    with Stage() as stage, pytest.raises(LockstepError, match="the companion hangs"):
+    told = "the companion hangs: its turn did not end in 1 s"
+    with Stage(patience_s=1.0) as stage, pytest.raises(LockstepError, match=told):
         stage.run(setup, lambda: time.sleep(3.0))
 
 
