@@ -10,7 +10,7 @@ import os
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium.error import ResetNeeded
@@ -21,11 +21,11 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.draw import GRID_COLOUR, MOVING_COLOURS, START_COLOUR, TEXT_COLOUR, draw_arena
 from airl_mav.arena.geometry import Arena, Obstacles, Shape
-from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
-from airl_mav.core.frames import quat_yaw
 from airl_mav.envs.fleet import Verdict
-from airl_mav.envs.navigation import Navigation
+from airl_mav.envs.navigation import Flights
+from airl_mav.envs.spec import EnvironmentSpec
+from airl_mav.profiles.camera_kind import CameraKind
 
 WIDTH_PX, HEIGHT_PX = 960, 540
 DPI = 100
@@ -36,12 +36,94 @@ TRAIL_COLOUR = "#c0392b"
 CIRCLE = np.linspace(0.0, 2.0 * math.pi, 25)[:-1]
 
 
-class EpisodeRenderer:
-    """Draws the first flight of a navigation; images are (HEIGHT_PX, WIDTH_PX, 3) uint8."""
+RENDER_MODES = ("rgb_array", "human")
 
-    def __init__(self, navigation: Navigation) -> None:
-        """Take what flies."""
-        self._navigation = navigation
+
+class Moment(NamedTuple):
+    """What a picture shows."""
+
+    arena: Arena
+    flights: Flights
+    """Of one vehicle: arrays (1,)."""
+    position: NDArray[np.float64]
+    """(3,) NED, true [m]."""
+    yaw: float
+    """True heading [rad]."""
+    scene_us: int
+    """Since the moving obstacles have set out [µs]."""
+    image: NDArray[np.uint8]
+    """(h, w), or (h, w, 3) in colour, as the network sees it."""
+
+
+class Pictures:
+    """Pictures of an environment's episodes, as its `render_mode` asks for them."""
+
+    def __init__(self, spec: EnvironmentSpec, kind: CameraKind, mode: str | None) -> None:
+        """Open the window of mode human.
+
+        Args:
+            spec: The environment.
+            kind: Of the camera whose image the network sees.
+            mode: None, or one of `RENDER_MODES`.
+
+        Raises:
+            UsageError: There is no such mode, or no display for a window.
+        """
+        if mode is not None and mode not in RENDER_MODES:
+            accepted = ", ".join(RENDER_MODES)
+            raise UsageError(f"render_mode = {mode!r}: accepted: None, {accepted}")
+        # A picture a decision: shown so often, a video of them runs in the time of the flight.
+        fps = 1.0 / spec.episode.hold_s
+        # Gymnasium's checker opens every mode that is offered.
+        offered = [each for each in RENDER_MODES if each != "human" or display_found()]
+        self.metadata: dict[str, Any] = {"render_modes": offered, "render_fps": fps}
+        """What the environment's `metadata` says of them."""
+        self.wanted = mode is not None
+        """Whether any will be asked for."""
+        self._spec, self._kind, self._mode = spec, kind, mode
+        self._renderer: EpisodeRenderer | None = None
+        self._trail: list[NDArray[np.float64]] = []
+        self._now: Moment | None = None
+        self._window = Window(fps) if mode == "human" else None
+
+    def begin(self) -> None:
+        """Begin an episode."""
+        self._trail.clear()
+
+    def see(self, now: Moment) -> None:
+        """Take the moment of a decision; a window shows it."""
+        self._now = now
+        self._trail.append(now.position[:2].copy())
+        if self._window is not None:
+            self._window.show(self._draw())
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Return the picture (540, 960, 3) of now with `rgb_array`; a window is shown by itself.
+
+        Raises:
+            ResetNeeded: No episode has begun.
+        """
+        return self._draw() if self._mode == "rgb_array" else None
+
+    def close(self) -> None:
+        """Close the window."""
+        if self._window is not None:
+            self._window.close()
+
+    def _draw(self) -> NDArray[np.uint8]:
+        if self._now is None:
+            raise ResetNeeded("render() before reset()")
+        if self._renderer is None:
+            self._renderer = EpisodeRenderer(self._spec, self._kind)
+        return self._renderer.draw(self._now, self._trail)
+
+
+class EpisodeRenderer:
+    """Draws a flight; pictures are (HEIGHT_PX, WIDTH_PX, 3) uint8."""
+
+    def __init__(self, spec: EnvironmentSpec, kind: CameraKind) -> None:
+        """Take the environment, and the kind of the camera whose image the network sees."""
+        self._spec, self._kind = spec, kind
         self._figure = Figure(figsize=(WIDTH_PX / DPI, HEIGHT_PX / DPI), dpi=DPI)
         self._canvas = FigureCanvasAgg(self._figure)
         self._background: Any = None
@@ -50,7 +132,7 @@ class EpisodeRenderer:
 
     def _begin(self, arena: Arena) -> None:
         """Draw what will not change in an episode."""
-        spec = self._navigation.spec
+        spec = self._spec
         self._arena = arena
         self._figure.clear()
         self._map = self._figure.add_axes((0.06, 0.1, 0.5, 0.84))
@@ -60,11 +142,8 @@ class EpisodeRenderer:
         self._eye.set_anchor("N")
         self._eye.set(xticks=[], yticks=[])
         self._eye.spines[:].set_color(GRID_COLOUR)
-        self._eye.set_title(
-            f"{self._navigation.observation.kind} that the network sees",
-            fontsize=11,
-            color=TEXT_COLOUR,
-        )
+        title = f"{self._kind} that the network sees"
+        self._eye.set_title(title, fontsize=11, color=TEXT_COLOUR)
         movers = range(arena.n_static, len(arena.obstacles))
         self._outlines = [_outline(arena.obstacles, i) for i in movers]
         face, edge = MOVING_COLOURS
@@ -95,44 +174,31 @@ class EpisodeRenderer:
         )
         self._background = None
 
-    def draw(
-        self, trail: Sequence[NDArray[np.float64]], image: NDArray[np.uint8]
-    ) -> NDArray[np.uint8]:
-        """Return the image of the present moment.
-
-        Args:
-            trail: Path so far: north, east [m].
-            image: (h, w), or (h, w, 3) in colour, as the network sees it.
-
-        Raises:
-            ResetNeeded: No episode has begun.
-        """
-        arena = self._navigation.arenas[0]
-        if arena is None:
-            raise ResetNeeded("render() before reset()")
+    def draw(self, now: Moment, trail: Sequence[NDArray[np.float64]]) -> NDArray[np.uint8]:
+        """Return the picture of a moment; `trail` is the path so far, north, east [m]."""
+        arena = now.arena
         if arena is not self._arena:
             self._begin(arena)
         if self._background is None:
             self._canvas.draw()
             self._background = self._canvas.copy_from_bbox(self._figure.bbox)
         self._canvas.restore_region(self._background)
-        self._update(arena, np.array(trail), image)
+        self._update(now, np.array(trail))
         for artist in (self._moving, self._trail, self._vehicle):
             self._map.draw_artist(artist)
         self._eye.draw_artist(self._image)
         self._figure.draw_artist(self._text)
         return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
 
-    def _update(self, arena: Arena, trail: NDArray[np.float64], image: NDArray[np.uint8]) -> None:
-        now, truth = self._navigation.flights(), self._navigation.truth()
-        position = truth.position[0]
-        centers = arena.centers_at(round(now.time_s[0] * US_PER_S))[arena.n_static :, 1::-1]
+    def _update(self, moment: Moment, trail: NDArray[np.float64]) -> None:
+        arena, now, position = moment.arena, moment.flights, moment.position
+        centers = arena.centers_at(moment.scene_us)[arena.n_static :, 1::-1]
         self._moving.set_verts(
             [outline + at for outline, at in zip(self._outlines, centers, strict=True)]
         )
         self._trail.set_data(trail[:, 1], trail[:, 0])
-        self._vehicle.set_xy(_arrow(float(quat_yaw(truth.quaternion[0]))) + position[1::-1])
-        self._image.set_data(image)
+        self._vehicle.set_xy(_arrow(moment.yaw) + position[1::-1])
+        self._image.set_data(moment.image)
         self._text.set_text(
             f"time   {now.time_s[0]:7.2f} s     {Verdict(int(now.verdict[0])).name.lower()}\n"
             f"goal   {now.goal_distance_m[0]:7.2f} m\n"

@@ -8,7 +8,8 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.core.errors import UsageError
+from airl_mav.core.constants import US_PER_S
+from airl_mav.core.frames import quat_yaw
 from airl_mav.envs.decisions import (
     Decisions,
     action_space,
@@ -20,7 +21,7 @@ from airl_mav.envs.decisions import (
 )
 from airl_mav.envs.fleet import Verdict
 from airl_mav.envs.navigation import Flights
-from airl_mav.envs.rendering import EpisodeRenderer, Window, display_found
+from airl_mav.envs.rendering import RENDER_MODES, Moment, Pictures
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.policy.layouts import newest_frame
 from airl_mav.policy.observation_spec import Encoded
@@ -36,7 +37,7 @@ class NavigationEnv(Decisions, gym.Env[Encoded, Any]):
     timeout). Only a timeout is a truncation.
     """
 
-    metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 2}  # noqa: RUF012
+    metadata = {"render_modes": list(RENDER_MODES), "render_fps": 2}  # noqa: RUF012
 
     def __init__(
         self, spec: EnvironmentSpec | None = None, *, render_mode: str | None = None, **knobs: Any
@@ -52,23 +53,12 @@ class NavigationEnv(Decisions, gym.Env[Encoded, Any]):
         Raises:
             UsageError: A knob or a profile cannot be used, or there is no display.
         """
-        modes = self.metadata["render_modes"]
-        if render_mode is not None and render_mode not in modes:
-            raise UsageError(f"render_mode = {render_mode!r}: accepted: None, {', '.join(modes)}")
         super().__init__(spec, knobs, 1)
         self.observation_space: gym.Space[Any] = observation_space(self.navigation.observation)
         self.action_space = action_space(self.environment.action_spec)
         self.render_mode = render_mode
-        # A picture a decision: shown so often, a video of them runs in the time of the flight.
-        fps = 1.0 / self.environment.episode.hold_s
-        self.metadata = self.metadata | {"render_fps": fps}
-        if not display_found():
-            # Gymnasium's checker opens every mode that is offered.
-            self.metadata["render_modes"] = [mode for mode in modes if mode != "human"]
-        self._image = np.zeros((0, 0), np.uint8)
-        self._trail: list[NDArray[np.float64]] = []
-        self._renderer: EpisodeRenderer | None = None
-        self._window = Window(fps) if render_mode == "human" else None
+        self._pictures = Pictures(self.environment, self.navigation.observation.kind, render_mode)
+        self.metadata = self.metadata | self._pictures.metadata
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -91,7 +81,7 @@ class NavigationEnv(Decisions, gym.Env[Encoded, Any]):
         super().reset(seed=seed)
         episode = draw_seeds(self.np_random, 1)[0] if seed is None else episode_seed(seed)
         flights = self._begin([0], [episode])
-        self._trail = []
+        self._pictures.begin()
         return self._observe(), self._info(flights)
 
     def step(self, action: Any) -> tuple[Encoded, float, bool, bool, dict[str, Any]]:
@@ -111,28 +101,30 @@ class NavigationEnv(Decisions, gym.Env[Encoded, Any]):
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return the picture (540, 960, 3) of now with `rgb_array`; a window is shown by itself."""
-        if self.render_mode != "rgb_array":
-            return None
-        return self._frame()
+        return self._pictures.render()
 
     def close(self) -> None:
         """Close the window."""
-        if self._window is not None:
-            self._window.close()
+        self._pictures.close()
 
     def _observe(self) -> Encoded:
         seen = {key: value[0] for key, value in self.navigation.observe().items()}
-        if self.render_mode is not None:
-            self._image = newest_frame(self.navigation.observation, seen)
-            self._trail.append(self.navigation.truth().position[0, :2])
-        if self._window is not None:
-            self._window.show(self._frame())
+        if self._pictures.wanted:
+            self._pictures.see(self._moment(seen))
         return seen
+
+    def _moment(self, seen: Encoded) -> Moment:
+        navigation = self.navigation
+        arena, flights, truth = navigation.arenas[0], navigation.flights(), navigation.truth()
+        assert arena is not None  # noqa: S101 (an episode has begun)
+        return Moment(
+            arena,
+            flights,
+            truth.position[0],
+            float(quat_yaw(truth.quaternion[0])),
+            round(flights.time_s[0] * US_PER_S),
+            newest_frame(navigation.observation, seen),
+        )
 
     def _info(self, now: Flights) -> dict[str, Any]:
         return {key: value[0].item() for key, value in self._quality(now).items()}
-
-    def _frame(self) -> NDArray[np.uint8]:
-        if self._renderer is None:
-            self._renderer = EpisodeRenderer(self.navigation)
-        return self._renderer.draw(self._trail, self._image)

@@ -8,13 +8,16 @@ from queue import Empty, SimpleQueue
 from threading import Thread, main_thread
 
 import numpy as np
+from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena
 from airl_mav.core.constants import TICK_S, US_PER_S, CommandKind
+from airl_mav.core.frames import quat_yaw
 from airl_mav.core.goals import goal_distance_m
 from airl_mav.envs.contact import CEILING, FLOOR, NOTHING, WALL
 from airl_mav.envs.fleet import Verdict
 from airl_mav.envs.navigation import Flights
+from airl_mav.envs.rendering import Moment
 from airl_mav.flight.judge import Outcome, Referee
 from airl_mav.lockstep.flight import Flight
 from airl_mav.policy.actions import Action, AnyAction, BodyRates
@@ -107,6 +110,10 @@ class AskedFlight:
         """Return how it has ended; None: it has not."""
         return self._account.outcome()
 
+    def moment(self, image: NDArray[np.uint8]) -> Moment:
+        """Return what a picture of now shows, with the image that the network sees."""
+        return self._account.moment(image)
+
     def end(self) -> FlownEpisode | None:
         """Call it off, where it is not over; return the flight when it has ended.
 
@@ -163,10 +170,20 @@ class _Account:
         verdict = None if self._referee is None else self._referee.verdict
         return None if verdict is None else verdict.outcome
 
+    def moment(self, image: NDArray[np.uint8]) -> Moment:
+        """Return what a picture of now shows."""
+        simulation, _ = self._flown()
+        truth, scene_us = simulation.truth, simulation.time_us - simulation.start_us
+        yaw = quat_yaw(truth.quaternion)
+        return Moment(self._arena, self.flights(), np.array(truth.position), yaw, scene_us, image)
+
+    def _flown(self) -> tuple[Simulation, Referee]:
+        assert self._simulation is not None  # noqa: S101 (nobody asks before the first tick)
+        assert self._referee is not None  # noqa: S101
+        return self._simulation, self._referee
+
     def _now(self) -> Flights:
-        simulation, referee = self._simulation, self._referee
-        assert simulation is not None  # noqa: S101 (nobody asks before the first tick)
-        assert referee is not None  # noqa: S101
+        simulation, referee = self._flown()
         truth, outcome = simulation.truth, self.outcome()
         began_us = simulation.time_us if referee.navigation_us is None else referee.navigation_us
         return Flights(

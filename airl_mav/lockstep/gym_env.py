@@ -9,8 +9,9 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from numpy.typing import NDArray
 
-from airl_mav.core.errors import FieldError, UsageError
+from airl_mav.core.errors import FieldError
 from airl_mav.envs.decisions import (
     action_space,
     checked_actions,
@@ -22,6 +23,7 @@ from airl_mav.envs.decisions import (
 from airl_mav.envs.delay import bounded, injections_of
 from airl_mav.envs.draws import source_of
 from airl_mav.envs.navigation import Flights
+from airl_mav.envs.rendering import RENDER_MODES, Pictures
 from airl_mav.envs.rewards import Step, costs, reward_of
 from airl_mav.envs.sight import sight_of
 from airl_mav.envs.spec import EnvironmentSpec, gymnasium_spec
@@ -29,7 +31,7 @@ from airl_mav.flight.judge import Outcome
 from airl_mav.lockstep.asked_flight import AskedFlight
 from airl_mav.lockstep.spec_scenario import BESIDE, scenario_of
 from airl_mav.policy.action_sets import command, commands
-from airl_mav.policy.layouts import encode_layout
+from airl_mav.policy.layouts import encode_layout, newest_frame
 from airl_mav.policy.observation import Observation
 from airl_mav.policy.observation_spec import Encoded
 from airl_mav.policy.registry import PolicyInfo
@@ -53,7 +55,7 @@ class RehearsalEnv(gym.Env[Encoded, Any]):
     crash, the newest one.
     """
 
-    metadata = {"render_modes": []}  # noqa: RUF012
+    metadata = {"render_modes": list(RENDER_MODES), "render_fps": 2}  # noqa: RUF012
 
     def __init__(
         self, spec: EnvironmentSpec | None = None, *, render_mode: str | None = None, **knobs: Any
@@ -62,16 +64,15 @@ class RehearsalEnv(gym.Env[Encoded, Any]):
 
         Args:
             spec: What it is made of; or
-            render_mode: None.
+            render_mode: As of `NavigationEnv`.
             knobs: the fields of an EnvironmentSpec; and, in either case, those of a Scenario that
                 say what it does not: firmware, real, plant, faults and the others of
                 `spec_scenario.BESIDE`.
 
         Raises:
-            UsageError: A knob or a profile cannot be used, or it is one of the batch twin alone.
+            UsageError: A knob or a profile cannot be used, or it is one of the batch twin alone, or
+                there is no display.
         """
-        if render_mode is not None:
-            raise UsageError(f"render_mode = {render_mode!r}: accepted: None")
         beside = {name: knobs.pop(name) for name in BESIDE if name in knobs}
         self.environment = bounded(gymnasium_spec(spec, knobs))
         self._reward = reward_of(self.environment.reward)
@@ -83,6 +84,9 @@ class RehearsalEnv(gym.Env[Encoded, Any]):
         if self._sees.goal_height and flat:
             accepted = f"false in arena {self.environment.arena!r}, whose goals have none"
             raise FieldError("goal_height", True, accepted)
+        self.render_mode = render_mode
+        self._pictures = Pictures(self.environment, self._sees.kind, render_mode)
+        self.metadata = self.metadata | self._pictures.metadata
         self._sources = injections_of(self.environment.delay)
         warm_up(self._resolved.vehicle, self._resolved.scenario.plant)
         self.observation_space: gym.Space[Any] = observation_space(self._sees)
@@ -107,7 +111,7 @@ class RehearsalEnv(gym.Env[Encoded, Any]):
             LockstepError: The companion hangs, or broke.
             gymnasium.error.Error: The seed is negative, or the vehicle has not taken off.
         """
-        self.close()
+        self._end()
         if seed is not None or options:
             zone = zone_option(options)
             scenario = self._resolved.scenario.model_copy(update={"zone": zone})
@@ -123,7 +127,9 @@ class RehearsalEnv(gym.Env[Encoded, Any]):
         asked = self._heard(flight.asked)
         if isinstance(asked, FlownEpisode):
             raise gym.error.Error(f"seed {self._seed}: it has not taken off: {asked.record.reason}")
+        self._pictures.begin()
         self._newest = self._encode(asked)
+        self._look(flight)
         self._before = flight.flights()
         self._last = np.zeros((1, 4 if self.environment.actions == "body-rates" else 3))
         return self._seen(), self._info(self._before)
@@ -151,17 +157,26 @@ class RehearsalEnv(gym.Env[Encoded, Any]):
         self._before, self._last = now, level
         if isinstance(asked, Observation):
             self._newest = self._encode(asked)
+        self._look(flight)
         info = self._info(now)
         if outcome is not None:
             info |= {"success": outcome is Outcome.SUCCESS, "outcome": outcome.value}
             self.flown = flight.end()
-            self.close()
+            self._end()
         truncated = outcome in (Outcome.TIMEOUT, Outcome.ABORTED)
         terminated = outcome is not None and not truncated
         return self._seen(), float(reward[0]), terminated, truncated, info
 
+    def render(self) -> NDArray[np.uint8] | None:
+        """Return the picture (540, 960, 3) of now with `rgb_array`; a window is shown by itself."""
+        return self._pictures.render()
+
     def close(self) -> None:
-        """End the flight, if there is one."""
+        """End the flight, if there is one, and close the window."""
+        self._end()
+        self._pictures.close()
+
+    def _end(self) -> None:
         if self._ending is not None:
             self._ending()
         self._flight = self._ending = None
@@ -171,11 +186,15 @@ class RehearsalEnv(gym.Env[Encoded, Any]):
         try:
             return ask()
         except BaseException:  # Ctrl-C, too: what the flight asks next would be taken for this.
-            self.close()
+            self._end()
             raise
 
     def _encode(self, asked: Observation) -> Encoded:
         return {key: rows[0] for key, rows in encode_layout(self._sees, asked.rows(None)).items()}
+
+    def _look(self, flight: AskedFlight) -> None:
+        if self._pictures.wanted:
+            self._pictures.see(flight.moment(newest_frame(self._sees, self._newest)))
 
     def _seen(self) -> Encoded:
         """Return the newest observation; whoever takes it may change it."""

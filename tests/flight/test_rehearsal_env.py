@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_env_for_sb3
+from stable_baselines3.common.env_util import make_vec_env
 
 from airl_mav.core.errors import UsageError
 from airl_mav.envs.decisions import FIRST_TRAINING_SEED
@@ -118,10 +119,31 @@ def test_a_loop_flies_what_the_rehearsal_flies(
 
 
 def test_both_checkers_are_content() -> None:
-    env = gym.make(REHEARSAL, arena="no-obstacles", episode={"time_limit_s": 3.0}).unwrapped
-    check_env(env, skip_render_check=True)
-    check_env_for_sb3(env)
+    knobs: dict[str, Any] = {"arena": "no-obstacles", "episode": {"time_limit_s": 3.0}}
+    env = gym.make(REHEARSAL, render_mode="rgb_array", **knobs).unwrapped
+    check_env(env)
+    check_env_for_sb3(env, skip_render_check=False)
     env.close()
+
+
+def test_pictures_are_those_of_the_twin_and_a_vec_env_of_sb3_takes_them() -> None:
+    """stable-baselines3's make_vec_env asks for pictures, whether or not it is asked for any."""
+    knobs = {"arena": "dynamic-obstacles"}
+    pictures = []
+    for name in (REHEARSAL, NAVIGATION):
+        env = make_vec_env(f"airl_mav:{name}", env_kwargs=knobs)
+        env.seed(3)
+        env.reset()
+        env.step(np.array([AHEAD]))
+        picture = env.render()
+        assert picture is not None
+        pictures.append(picture.astype(int))
+        env.close()
+    assert pictures[0].shape == (540, 960, 3)
+    # The same map, with movers and vehicle where they were there, but for a frame's time.
+    differs = np.abs(pictures[0] - pictures[1]).max(axis=2) > 30
+    assert differs[:, :540].mean() < 0.004
+    assert (np.abs(pictures[0] - 255).max(axis=2) > 0).mean() > 0.1, "there is something on it"
 
 
 def test_episodes_one_after_the_other_as_in_the_batch_twin() -> None:
@@ -206,7 +228,7 @@ def test_what_ends_an_episode(tmp_path: Path) -> None:
         ({"firmwares": "px4"}, "unexpected keyword argument 'firmwares'"),
         ({"firmware": "px5"}, "firmware 'px5': accepted: .*'px4'"),
         ({"firmware": "ardupilot"}, "firmware"),
-        ({"render_mode": "human"}, "render_mode = 'human': accepted: None"),
+        ({"render_mode": "ansi"}, "render_mode = 'ansi': accepted: None, rgb_array, human"),
         ({"curriculum": {}}, "curriculum .*: accepted: None: only the batch twin has another"),
         ({"delay": {"link_ms": 9}}, r"delay\.link_ms 9: accepted: 4"),
         ({"goal_height": True}, "goal_height True: accepted: false in arena"),

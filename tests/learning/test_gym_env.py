@@ -20,7 +20,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from stable_baselines3 import PPO
 from stable_baselines3.common.env_checker import check_env as check_env_for_sb3
 
-import airl_mav.envs.single
+import airl_mav.envs.rendering
 from airl_mav.arena.generate import generate
 from airl_mav.core.errors import UsageError
 from airl_mav.envs.decisions import FIRST_TRAINING_SEED
@@ -67,7 +67,7 @@ def window(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[np.ndarray]]:
     backend: Any = types.ModuleType("pretended_display")
     backend.FigureCanvas = _Canvas
     monkeypatch.setitem(sys.modules, backend.__name__, backend)
-    monkeypatch.setattr(airl_mav.envs.single, "display_found", lambda: True)
+    monkeypatch.setattr(airl_mav.envs.rendering, "display_found", lambda: True)
     _Canvas.shown.clear()
     with mpl.rc_context():
         pyplot.switch_backend(f"module://{backend.__name__}")
