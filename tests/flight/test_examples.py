@@ -71,6 +71,7 @@ def test_own_policy(tmp_path: Path) -> None:
     assert len(re.findall(r"^seed \d: (success|collision|timeout), ", text, re.M)) == 2
 
 
+@pytest.mark.nightly  # It learns; the environment itself: test_rehearsal_env.py.
 def test_gymnasium_px4(tmp_path: Path) -> None:
     """Learned in the twin, it flies there as in lockstep."""
     text = output_of("gymnasium_px4.py", tmp_path)

@@ -119,7 +119,7 @@ def test_a_loop_flies_what_the_rehearsal_flies(
 
 
 def test_both_checkers_are_content() -> None:
-    knobs: dict[str, Any] = {"arena": "no-obstacles", "episode": {"time_limit_s": 3.0}}
+    knobs: dict[str, Any] = {"arena": "no-obstacles", "episode": {"time_limit_s": 1.0}}
     env = gym.make(REHEARSAL, render_mode="rgb_array", **knobs).unwrapped
     check_env(env)
     check_env_for_sb3(env, skip_render_check=False)
@@ -310,6 +310,7 @@ def test_a_loop_with_px4_s_stand_in(tmp_path: Path, px4_instance: int) -> None:
         assert info["flight_time_s"] > 0.5
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_loop_that_loses_its_firmware(tmp_path: Path, px4_instance: int) -> None:
     build = write_build(tmp_path / "px4", "--fault", "die@1")
