@@ -37,6 +37,7 @@ CIRCLE = np.linspace(0.0, 2.0 * math.pi, 25)[:-1]
 
 
 RENDER_MODES = ("rgb_array", "human")
+"""Pictures as arrays, or in a window."""
 
 
 class Moment(NamedTuple):

@@ -41,7 +41,6 @@ IDLE: dict[CommandKind, AnyAction] = {
 }
 """What a flight that is called off is answered with; it is not sent any more."""
 
-
 LEAVING_S = 0.2
 """A flight that waits for a decision looks so often whether the program ends [wall s]."""
 
@@ -53,11 +52,10 @@ class AskedFlight:
     return while the flight waits, so that its state stands.
     """
 
-    def __init__(self, resolved: ResolvedScenario, seed: int, arena: Arena) -> None:
+    def __init__(self, resolved: ResolvedScenario, seed: int) -> None:
         """Begin a flight: it takes off, and asks for the first decision."""
         self._events: SimpleQueue[Observation | FlownEpisode | BaseException] = SimpleQueue()
         self._answers: SimpleQueue[AnyAction] = SimpleQueue()
-        self._account = _Account(arena)
         self._idle = IDLE[resolved.pilot.commands]
         self._flight = Flight(
             resolved,
@@ -66,8 +64,9 @@ class AskedFlight:
             seed,
             patience_s=math.inf,
             lands=False,  # What it asks then is how the vehicle stands when the time is up.
-            ticked=self._account.ticked,
+            ticked=lambda *seen: self._account.ticked(*seen),
         )
+        self._account = _Account(self._flight.arena)
         self._end: FlownEpisode | BaseException | None = None
         # Not a daemon: MAVSDK is no longer there when those are ended.
         self._thread = Thread(target=self._fly, name="rehearsal")

@@ -176,8 +176,9 @@ class Flight:
         self._resolved, self._policy, self._index, self._seed = resolved, policy, index, seed
         self._observer = observer or Observer()
         self._ticks = 0
-        self._arena = resolved.arena_of(seed)
-        self._goal = self._arena.goal_point
+        self.arena = resolved.arena_of(seed)
+        """Where it flies."""
+        self._goal = self.arena.goal_point
         self._witnessed = resolved.scenario.firmware == "builtin"
         self._digest = FlightDigest() if self._witnessed else Unwitnessed()
         self._stop = threading.Event()
@@ -203,7 +204,7 @@ class Flight:
         resolved = self._resolved
         setup = EpisodeSetup(
             resolved.vehicle,
-            self._arena,
+            self.arena,
             self._seed,
             resolved.scenario,
             resolved.computer.onboard_watts,
@@ -246,7 +247,7 @@ class Flight:
     def _begun(self, started_us: int) -> None:
         self._supervisor.started_us = started_us
         if self._watched is not None:
-            self._watched.begin(self._seed, self._arena, started_us)
+            self._watched.begin(self._seed, self.arena, started_us)
         self._observer.episode(self._index, self._seed, self._goal)
 
     # --- the companion's thread

@@ -121,7 +121,7 @@ class RehearsalEnv(gym.Env[Encoded, Any]):
         resolved = self._resolved
         if len(self._sources) > 1:
             resolved = replace(resolved, injection=source_of(self._sources, self._seed))
-        flight = AskedFlight(resolved, self._seed, resolved.arena_of(self._seed))
+        flight = AskedFlight(resolved, self._seed)
         self._flight, self._ending = flight, weakref.finalize(self, flight.end)
         self._ending.atexit = False  # The flight sees to that itself.
         asked = self._heard(flight.asked)
@@ -131,7 +131,8 @@ class RehearsalEnv(gym.Env[Encoded, Any]):
         self._newest = self._encode(asked)
         self._look(flight)
         self._before = flight.flights()
-        self._last = np.zeros((1, 4 if self.environment.actions == "body-rates" else 3))
+        by_rates = self.environment.action_spec.commands == "body_rates"
+        self._last = np.zeros((1, 4 if by_rates else 3))
         return self._seen(), self._info(self._before)
 
     def step(self, action: Any) -> tuple[Encoded, float, bool, bool, dict[str, Any]]:
