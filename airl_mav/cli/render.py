@@ -46,11 +46,12 @@ from airl_mav.report.camera_pictures import (
     write_film,
     write_png,
 )
-from airl_mav.report.camera_taken import TakingCamera, taken_film
 from airl_mav.report.ground_truth import (
     ARRAY,
     TRUTHS,
+    TakingCamera,
     coloured_flow,
+    taken_film,
     truth_film,
     truth_of,
     write_array,

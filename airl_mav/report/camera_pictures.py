@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from matplotlib import colormaps
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -17,6 +18,14 @@ from airl_mav.arena.geometry import Arena
 from airl_mav.camera.frame import depth_to_z16
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.picture import antialiased, grey, render_picture
+from airl_mav.camera.primitives import (
+    CEILING,
+    FLOOR,
+    OBSTACLE,
+    SKY,
+    WALL_EAST_WEST,
+    WALL_NORTH_SOUTH,
+)
 from airl_mav.camera.render import camera_pose
 from airl_mav.core.constants import US_PER_MS
 from airl_mav.core.errors import UsageError
@@ -25,7 +34,33 @@ from airl_mav.flight.trajectory import pose_at
 from airl_mav.report.depth_colours import coloured
 from airl_mav.report.forensics.camera_view import PolicyCamera
 from airl_mav.report.replay.flight import ReplayedFlight
-from airl_mav.report.segmentation_colours import coloured_segmentation
+
+ROOM = {
+    CEILING: (236, 238, 240),
+    SKY: (38, 42, 48),
+    FLOOR: (120, 124, 130),
+    WALL_NORTH_SOUTH: (178, 184, 192),
+    WALL_EAST_WEST: (208, 212, 218),
+}
+"""Colours of what is no obstacle; no obstacle has a grey."""
+
+
+def coloured_segmentation(seen: NDArray[np.int32]) -> NDArray[np.uint8]:
+    """Return what is seen (h, w), `Picture.seen`, in colour, RGB (h, w, 3).
+
+    Obstacles have the colours of matplotlib's tab20 without its greys, over and over.
+    """
+    tab20 = colormaps["tab20"](np.arange(20), bytes=True)[:, :3]
+    own = np.delete(tab20, (14, 15), axis=0)
+    most = max(int(seen.max(initial=0)) + 1, OBSTACLE)
+    # The number of the ceiling is -1: the last row.
+    table = np.empty((most + 1, 3), np.uint8)
+    table[OBSTACLE:most] = own[np.arange(most - OBSTACLE) % len(own)]
+    for number, colour in ROOM.items():
+        table[number] = colour
+    coloured: NDArray[np.uint8] = table[seen]
+    return coloured
+
 
 Shown = Literal["rgb", "grey", "depth", "segmentation", "flow"]
 Pixels = NDArray[np.uint8]

@@ -1,15 +1,98 @@
-"""The run folder of a black box, beside it, which every report and comparison reads."""
+"""The run folder of a black box, beside it, which every report and comparison reads.
+
+The path is the estimate at the rate of the log's attitude, the power that of its battery monitor,
+and the motor outputs are there. The log's times become those of the companion's clock; as those of
+NTP, they take both ways on the link for equally long (D. Mills, RFC 5905, section 8).
+"""
 
 from __future__ import annotations
 
 import hashlib
 from pathlib import Path
+from typing import Any
 
-from airl_mav.black_box.reading import read_black_box
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.black_box.reading import BlackBox, read_black_box
+from airl_mav.core.constants import US_PER_MS
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import sha256_of
-from airl_mav.rehearsal.run_folder import RUN_FILE, RunFolder, load_info
-from airl_mav.report.recorded_flight import DIGEST, episode_of, info_of
+from airl_mav.flight.trajectory import Trajectory
+from airl_mav.latency.stamps import SETPOINTS, commanded
+from airl_mav.rehearsal.run_folder import RUN_FILE, FlownEpisode, RunFolder, load_info
+from airl_mav.report.recorded_flight import DIGEST, episode_of, info_of, path_of, stamps_of
+from airl_mav.report.tracking import MOTOR_OUTPUTS, MOTOR_TIMES
+from airl_mav.vehicle_log.alignment import Alignment, align
+from airl_mav.vehicle_log.ulog import VehicleLog
+
+
+def logged_episode_of(box: BlackBox, log: VehicleLog) -> FlownEpisode:
+    """Return the flight, with the path, the power and the motor outputs of the vehicle's log.
+
+    Raises:
+        UsageError: The black box does not hold its settings, or the log is of another flight.
+    """
+    told = path_of(box)
+    stamps = stamps_of(box)
+    kind = commanded(stamps)
+    setpoints = np.asarray(stamps[SETPOINTS[kind]], np.float64)
+    clocks = align(told, log, stamps["sent_us"], setpoints, kind)
+    ahead_us = offset_us(clocks)
+    path = _path(told, log, clocks.told_us, ahead_us)
+    note = (
+        f"path, power and motor outputs are those of {log.path.name}; its clock is"
+        f" {-ahead_us / US_PER_MS:+.1f} ms ahead of the recording's, by attitude and velocity in"
+        f" both (which agree to {clocks.error_m_s:.3f} m/s) and {clocks.setpoints} setpoints"
+    )
+    episode = episode_of(box, path, (note,))
+    columns: dict[str, NDArray[Any]] = {
+        **episode.latency,
+        MOTOR_TIMES: np.round(log.motors.time_us + ahead_us).astype(np.int64),
+        MOTOR_OUTPUTS: log.motors.values.astype(np.float32),
+    }
+    return FlownEpisode(episode.record, path, columns)
+
+
+def offset_us(clocks: Alignment) -> float:
+    """Return what is added to the log's times to have the companion's [µs].
+
+    Half of the round trip is the way up, where both ways are known together.
+    """
+    if clocks.accepted_us is None:
+        return clocks.told_us
+    return 0.5 * (clocks.told_us - clocks.accepted_us)
+
+
+def _path(told: Trajectory, log: VehicleLog, told_us: float, ahead_us: float) -> Trajectory:
+    """Return the log's estimate at the times of its attitude, and what the battery gave."""
+    attitude, motion = log.attitude, log.motion
+    inside = (attitude.time_us >= motion.time_us[0]) & (attitude.time_us <= motion.time_us[-1])
+    logged_us, quaternion = attitude.time_us[inside], attitude.values[inside]
+    state = motion.at(logged_us)
+    # Both count from the estimator's origin; where they do not, the recording's is the goal's.
+    both = (told.time_us - told_us >= motion.time_us[0]) & (
+        told.time_us - told_us <= motion.time_us[-1]
+    )
+    apart = told.position[both] - motion.at(told.time_us[both] - told_us)[:, :3]
+    position = state[:, :3] + np.median(apart, axis=0)
+    length = np.linalg.norm(quaternion, axis=1, keepdims=True)
+    times_us = np.round(logged_us + ahead_us).astype(np.int64)
+    power_w = _power_w(log, logged_us, told, times_us)
+    return Trajectory(times_us, position, state[:, 3:], quaternion / length, power_w)
+
+
+def _power_w(
+    log: VehicleLog, logged_us: NDArray[np.int64], told: Trajectory, times_us: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Return the power (n,) that the battery gave; the recording's where the log has none."""
+    battery = log.battery
+    known = np.isfinite(battery.values[:, :2]).all(axis=1) if len(battery) else np.zeros(0, bool)
+    if not known.any():
+        return np.interp(times_us, told.time_us, told.power_w)
+    watts = battery.values[known, 0] * battery.values[known, 1]
+    return np.asarray(np.interp(logged_us, battery.time_us[known], watts), np.float64)
+
 
 WITH_LOG = "-with-log"
 """Ends the name of the run folder of a flight with the vehicle's own log."""
@@ -31,7 +114,7 @@ def take_in(path: Path, ulg: Path | None = None) -> Path:
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
     if ulg is not None:
         # Imported here: pyulog is an extra.
-        from airl_mav.report.logged_flight import logged_episode_of
+        from airl_mav.report.recording_folder import logged_episode_of
         from airl_mav.vehicle_log.ulog import read_vehicle_log
 
         log = read_vehicle_log(ulg)

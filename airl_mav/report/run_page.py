@@ -14,7 +14,7 @@ from airl_mav.arena.geometry import Arena
 from airl_mav.core.files import replace_file
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import LoadedRun
-from airl_mav.report.ages import ages_table, run_ages
+from airl_mav.report.ages import ages_table, estimation_table, run_ages
 from airl_mav.report.conduct import conduct_table
 from airl_mav.report.document import (
     REPORT_FILE,
@@ -30,7 +30,6 @@ from airl_mav.report.energy import (
     energy_table,
     flight_energies,
 )
-from airl_mav.report.estimation import estimation_table
 from airl_mav.report.faults import faults_table
 from airl_mav.report.flight_data import BEST
 from airl_mav.report.flights_above import overview_picture

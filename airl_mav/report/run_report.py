@@ -18,7 +18,7 @@ from airl_mav.report.arenas import arenas_of, vehicle_of
 from airl_mav.report.conduct import conduct_table
 from airl_mav.report.document import print_verdict
 from airl_mav.report.faults import faults_table
-from airl_mav.report.forensics.ranking import ranked
+from airl_mav.report.forensics.evidence import ranked
 from airl_mav.report.forensics.worst import EXAMINED
 from airl_mav.report.run_page import build_page
 from airl_mav.report.run_summary import summarize_run

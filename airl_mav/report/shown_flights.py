@@ -14,8 +14,7 @@ from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report.depth_colours import palette
 from airl_mav.report.faults import fault_spans_s
 from airl_mav.report.flight_data import chosen, flight_data
-from airl_mav.report.forensics.evidence import Cause
-from airl_mav.report.forensics.ranking import ranked
+from airl_mav.report.forensics.evidence import Cause, ranked
 from airl_mav.report.forensics.worst import flown_path
 from airl_mav.report.policy_view import PolicyAgain, SeenDecision, policy_again, seen_decisions
 from airl_mav.report.run_figures import map_figure

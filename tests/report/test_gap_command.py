@@ -36,9 +36,9 @@ from airl_mav.profiles.loading import profiles_dir
 from airl_mav.rehearsal.episode_saver import EpisodeSaver
 from airl_mav.rehearsal.run_folder import FlownEpisode
 from airl_mav.report.comparison import show
+from airl_mav.report.comparison.documents import worst_seeds
 from airl_mav.report.comparison.gap import gaps_table, runs_table
 from airl_mav.report.comparison.model import load_comparison, save_comparison
-from airl_mav.report.comparison.seeds import worst_seeds
 from airl_mav.report.comparison.show import build_comparison, rebuild_comparison
 from airl_mav.report.comparison.tables import contrast_table
 from airl_mav.report.measures import ALL_MEASURES

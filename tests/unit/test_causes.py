@@ -26,8 +26,13 @@ from airl_mav.report.forensics.camera_view import (
     view_obstacle,
     view_wall,
 )
-from airl_mav.report.forensics.causes import USUAL, cause_of
-from airl_mav.report.forensics.collisions import decisions_in_effect, examine_collision, hit_number
+from airl_mav.report.forensics.causes import (
+    USUAL,
+    cause_of,
+    decisions_in_effect,
+    examine_collision,
+    hit_number,
+)
 from airl_mav.report.forensics.evidence import (
     NO_CAUSE,
     Evidence,
@@ -37,7 +42,7 @@ from airl_mav.report.forensics.evidence import (
     time_lost_s,
     usual_flight,
 )
-from airl_mav.report.forensics.limit_cycles import (
+from airl_mav.report.forensics.long_flights import (
     MIN_TURNS,
     SPOT_M,
     longest_limit_cycle,

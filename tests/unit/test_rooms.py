@@ -22,8 +22,7 @@ from airl_mav.arena.describe import arena_table
 from airl_mav.arena.draw import OPENING_COLOUR, draw_arena
 from airl_mav.arena.footprints import bounding_boxes
 from airl_mav.arena.generate import generate, local_bounds
-from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape
-from airl_mav.arena.indoors import seen_across
+from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape, seen_across
 from airl_mav.arena.rooms import Plan, draw_plan, over_doors
 from airl_mav.camera import primitives
 from airl_mav.camera.intrinsics import Intrinsics
@@ -33,7 +32,7 @@ from airl_mav.envs.arenas import batch_of
 from airl_mav.envs.contact import CEILING, FLOOR, NOTHING, WALL, clearance, touches
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile, profile_digest
-from airl_mav.report.segmentation_colours import ROOM, coloured_segmentation
+from airl_mav.report.camera_pictures import ROOM, coloured_segmentation
 from airl_mav.view.messages import ArenaShown
 
 WIDTH_M = 0.55

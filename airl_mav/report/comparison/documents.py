@@ -5,10 +5,77 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from statistics import median
+from typing import Any
 
+from airl_mav.flight.judge import Outcome
+from airl_mav.flight.paired import pair_by_seed
+from airl_mav.flight.record import EpisodeRecord
 from airl_mav.rehearsal.run_folder import LoadedRun
+from airl_mav.report.comparison.build import tests_of
 from airl_mav.report.comparison.model import Comparison
 from airl_mav.report.document import Document, Facts, Section, provenance_facts, run_link
+
+WORST = 6
+"""Seeds that are looked at one by one."""
+
+WIDEST = 3
+"""Pairs that are named for differing most."""
+
+
+def worst_seeds(reference: Sequence[EpisodeRecord], target: Sequence[EpisodeRecord]) -> list[int]:
+    """Return seeds that lost most: half of them failed, half took longest against the reference.
+
+    The reference reached the goal with all of them. Of those that failed the first seeds are taken.
+    """
+    failed: list[int] = []
+    slower: dict[int, float] = {}
+    for first, second in pair_by_seed(reference, target):
+        if first.outcome is not Outcome.SUCCESS or first.quality is None:
+            continue
+        if second.outcome is not Outcome.SUCCESS:
+            failed.append(first.seed)
+        elif second.quality is not None:
+            slower[first.seed] = second.quality.flight_time_s / first.quality.flight_time_s
+    longest = sorted(slower, key=lambda seed: (-slower[seed], seed))
+    chosen = sorted(failed)[: max(WORST // 2, WORST - len(longest))]
+    return [*chosen, *longest[: WORST - len(chosen)]]
+
+
+def split_seeds(runs: Mapping[str, LoadedRun]) -> list[dict[str, Any]]:
+    """Return the seeds of which not all flights reached the goal, but one did.
+
+    Returns:
+        For each its `seed`, and its `outcomes` by run; invalid flights are left out.
+    """
+    flights: dict[int, dict[str, EpisodeRecord]] = {}
+    for name, run in runs.items():
+        for episode in tests_of(run):
+            flights.setdefault(episode.seed, {})[name] = episode
+    return [
+        {"seed": seed, "outcomes": {name: f.outcome.value for name, f in flights[seed].items()}}
+        for seed in sorted(flights)
+        if len({f.outcome is Outcome.SUCCESS for f in flights[seed].values()}) > 1
+    ]
+
+
+def widest_seeds(reference: LoadedRun, level: LoadedRun) -> dict[str, Any] | None:
+    """Return the median difference in flight time and the seeds of the widest [%].
+
+    None with fewer than three common successes.
+    """
+    percent = {
+        first.seed: 100.0 * (second.quality.flight_time_s / first.quality.flight_time_s - 1.0)
+        for first, second in pair_by_seed(reference.episodes, level.episodes)
+        if first.outcome is second.outcome is Outcome.SUCCESS and first.quality and second.quality
+    }
+    if len(percent) < WIDEST:
+        return None
+    widest = sorted(percent, key=lambda seed: -abs(percent[seed]))[:WIDEST]
+    return {
+        "median": median(percent.values()),
+        "seeds": [{"seed": seed, "percent": percent[seed]} for seed in widest],
+    }
 
 
 def comparison_document(

@@ -40,23 +40,21 @@ from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.stages import stage_durations
 from airl_mav.latency.stamps import NO_STAMP, SETPOINT
 from airl_mav.profiles.camera_kind import CameraKind
-from airl_mav.report.export_log.foxglove_types import (
+from airl_mav.report.export_log.recorded import RecordedFlight, charge_of, decision_messages
+from airl_mav.report.export_log.scene import (
     CAMERA,
     ESTIMATE,
     VEHICLE,
     WORLD,
+    arena_scene,
     attitude,
     channel,
+    movers_scene,
+    path_scene,
     place,
     quaternion,
     timestamp,
     vector,
-)
-from airl_mav.report.export_log.recorded import RecordedFlight, charge_of, decision_messages
-from airl_mav.report.export_log.scene import (
-    arena_scene,
-    movers_scene,
-    path_scene,
     vehicle_scene,
     velocity_scene,
 )

@@ -14,10 +14,11 @@ from airl_mav.arena.geometry import Arena
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory
+from airl_mav.rehearsal.run_folder import LoadedRun
 
 if TYPE_CHECKING:
-    # Whoever ranks flights by their records draws no image.
     from airl_mav.report.forensics.camera_view import PolicyCamera
+
 
 HALF_WIDTH_M = 0.3
 """Room that a vehicle takes to either side."""
@@ -91,3 +92,20 @@ def path_excess(record: EpisodeRecord) -> float | None:
     if record.quality is None:
         return None
     return record.quality.distance_m / straight_m(record) - 1.0
+
+
+def ranked(run: LoadedRun) -> list[EpisodeRecord]:
+    """Return all flights, the worst first.
+
+    Those that failed come first, then those that reached the goal; each by the time they lost, or
+    took where no flight reached the goal.
+    """
+    usual = usual_flight(run.episodes)
+
+    def key(e: EpisodeRecord) -> tuple[bool, float, int]:
+        lost_s = time_lost_s(e, usual)
+        if lost_s is None:
+            lost_s = 0.0 if e.quality is None else e.quality.flight_time_s
+        return (e.outcome is Outcome.SUCCESS, -lost_s, e.index)
+
+    return sorted(run.episodes, key=key)

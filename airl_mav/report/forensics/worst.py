@@ -23,10 +23,10 @@ from airl_mav.report.forensics.evidence import (
     Cause,
     Evidence,
     path_excess,
+    ranked,
     time_lost_s,
     usual_flight,
 )
-from airl_mav.report.forensics.ranking import ranked
 from airl_mav.report.table import NONE, OUTCOME_LABELS, Column, TableView
 
 EXAMINED = 100

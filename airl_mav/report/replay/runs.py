@@ -11,7 +11,7 @@ from airl_mav.flight.record import NO_ARENA, EpisodeRecord
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import CAMPAIGN_FILE, RUN_FILE, LoadedRun, load
 from airl_mav.report.arenas import arenas_of, spec_of, vehicle_of
-from airl_mav.report.forensics.ranking import ranked
+from airl_mav.report.forensics.evidence import ranked
 from airl_mav.report.replay.flight import ReplayedFlight
 
 
