@@ -47,9 +47,8 @@ from airl_mav.core.frames import quat_from_euler  # noqa: E402
 from airl_mav.profiles.arena import ArenaSpec  # noqa: E402
 from airl_mav.profiles.loading import load_profile  # noqa: E402
 from airl_mav.profiles.vehicle import load_vehicle  # noqa: E402
-from airl_mav.view.ends import ViewEnds  # noqa: E402
+from airl_mav.view.ends import Request, ViewEnds  # noqa: E402
 from airl_mav.view.feed import Feed  # noqa: E402
-from airl_mav.view.handshake import Request  # noqa: E402
 from airl_mav.view.messages import (  # noqa: E402
     ArenaShown,
     Decided,

@@ -1,14 +1,50 @@
-"""Messages as bytes, and the channel that says what they are: of files and of live streams."""
+"""Messages as bytes, and the channel that says what they are: of files and of live streams.
+
+Its parser (packages/mcap-support/src/parseJsonSchema.ts in foxglove/studio) wants every property
+with one plain `type`, arrays with one `items`, and bytes as base64; it follows no references and
+knows no alternatives.
+"""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from pydantic import TypeAdapter
 
 from airl_mav.black_box.messages import SCHEMAS, TOPICS, Message
-from airl_mav.black_box.schemas import foxglove_schema
+
+UNKNOWN = "null: not known"
+
+
+def foxglove_schema(kind: type[Any]) -> dict[str, Any]:
+    """Return the schema of a message's class: an object, written out in one piece.
+
+    What may be null has the type that it has otherwise, and says so in its description. Elements
+    of a tuple are of one type.
+    """
+    schema = TypeAdapter(kind).json_schema()
+    return _plain(schema, schema.get("$defs", {}))
+
+
+def _plain(schema: Mapping[str, Any], named: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a schema without references, alternatives and tuples."""
+    if "$ref" in schema:
+        return _plain(named[schema["$ref"].removeprefix("#/$defs/")], named)
+    if "anyOf" in schema:
+        known = [each for each in schema["anyOf"] if each.get("type") != "null"]
+        return {**_plain(known[0], named), "description": UNKNOWN}
+    plain = {key: value for key, value in schema.items() if key not in ("$defs", "prefixItems")}
+    if "properties" in schema:
+        plain["properties"] = {
+            name: _plain(each, named) for name, each in schema["properties"].items()
+        }
+    if schema.get("type") == "array":
+        items = schema.get("items") or schema["prefixItems"][0]
+        plain["items"] = _plain(items, named)
+    return plain
+
 
 JSON = "json"
 """Encoding of our own messages."""

@@ -27,9 +27,8 @@ from airl_mav.policy.action_sets import commands, discrete_actions
 from airl_mav.policy.layouts import newest_frame
 from airl_mav.policy.observation_spec import Encoded
 from airl_mav.training.store import Evaluation, TrainingProgress
-from airl_mav.view.ends import ViewEnds
+from airl_mav.view.ends import Request, ViewEnds
 from airl_mav.view.feed import Feed
-from airl_mav.view.handshake import Request
 from airl_mav.view.messages import (
     ArenaShown,
     Decided,

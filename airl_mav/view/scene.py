@@ -44,10 +44,12 @@ from airl_mav.view.look import (
     START,
     WALL_OPACITY,
     Look,
+    arrow,
+    segments_of,
+    walls,
 )
 from airl_mav.view.messages import Episode, Vehicle, VehicleShape
 from airl_mav.view.pictures import camera_picture
-from airl_mav.view.shapes import arrow, segments_of, walls
 from airl_mav.view.shown import Shown
 
 FRUSTUM_M = 0.6

@@ -13,8 +13,7 @@ from airl_mav.core.child_process import ChildProcess
 from airl_mav.core.errors import FieldError
 from airl_mav.core.ports import LOOPBACK
 from airl_mav.scenario.resolved import ResolvedScenario
-from airl_mav.view.ends import ViewEnds
-from airl_mav.view.handshake import Answer, Request
+from airl_mav.view.ends import Answer, Request, ViewEnds
 from airl_mav.view.pace import REAL_TIME
 
 MODULE = "airl_mav.view.server"

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
+from airl_mav.black_box.channels import foxglove_schema
 from airl_mav.black_box.messages import (
     SCHEMAS,
     TOPICS,
@@ -31,7 +32,6 @@ from airl_mav.black_box.messages import (
     text,
 )
 from airl_mav.black_box.reading import read_black_box
-from airl_mav.black_box.schemas import foxglove_schema
 from airl_mav.black_box.writing import BlackBoxFile
 from airl_mav.camera.frame import Frame, FurtherImage
 from airl_mav.camera.intrinsics import Intrinsics

@@ -33,7 +33,6 @@ from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
-from airl_mav.view.by_hand import Hand, HandCompensator, HandLatency
 from airl_mav.view.feed import QUEUED, Asked, Ends, Feed
 from airl_mav.view.messages import (
     ArenaShown,
@@ -49,10 +48,10 @@ from airl_mav.view.messages import (
     to_parts,
 )
 from airl_mav.view.pace import Pace
-from airl_mav.view.pictures import NO_RETURN, camera_picture, numbers_html, texts_html
+from airl_mav.view.pictures import NO_RETURN, VIRIDIS, camera_picture, numbers_html, texts_html
 from airl_mav.view.shown import STRIP_S, Shown
+from airl_mav.view.taps import Hand, HandCompensator, HandLatency
 from airl_mav.view.viewer import Viewer, request_of
-from airl_mav.view.viridis import VIRIDIS
 from tests.support.ports import free_ports
 from tests.support.processes import run_alone, wait_until
 
@@ -613,7 +612,7 @@ def test_hills_are_told_and_shown_as_they_are() -> None:
 
 def test_walls_are_seen_from_inside() -> None:
     pytest.importorskip("viser")
-    from airl_mav.view.shapes import walls
+    from airl_mav.view.look import walls
 
     inside = np.array([10.0, 0.0, -2.0])
     for ceiling, count in ((False, 8), (True, 10)):
