@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from airl_mav.arena.appearance import Statics
-from airl_mav.arena.assets import Things, draw_things
+from airl_mav.arena.assets import Things, draw_things, generate_own
 from airl_mav.arena.bodies import Bodies, draw_bodies
 from airl_mav.arena.footprints import Boxes, Floats, bounding_boxes, footprint_areas, join
 from airl_mav.arena.gates import (
@@ -23,10 +23,9 @@ from airl_mav.arena.gates import (
 )
 from airl_mav.arena.geometry import Arena, Bounds, Building, Obstacles, PlacedMesh, Tour
 from airl_mav.arena.ground import Ground
-from airl_mav.arena.hills import draw_ground, stand_on
-from airl_mav.arena.own import generate_own
 from airl_mav.arena.passage import Hills, free_share, least_gap_m, passage_exists
 from airl_mav.arena.placement import TRIES, NoRoomError, place_all
+from airl_mav.arena.relief import draw_ground, stand_on
 from airl_mav.arena.rooms import Plan, draw_plan, room_walls, standing_on_the_floor
 from airl_mav.arena.tours import draw_tours
 from airl_mav.arena.zones import draw_goal, zone_radius_m

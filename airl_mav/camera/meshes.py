@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.camera.bvh import STACK, Bvh, Meshes
-from airl_mav.camera.mesh_parts import part_of
-from airl_mav.camera.mesh_triangles import Faces, draw_triangle, met
+from airl_mav.camera.mesh_triangles import Faces, draw_triangle, met, part_of
 from airl_mav.camera.primitives import OBSTACLE, Ids, Line, Lines, Rectangles, turned
 from airl_mav.camera.projection import (
     Bent,

@@ -23,8 +23,7 @@ from airl_mav.experiments.executors import (
     InProcessExecutor,
     WorkerError,
 )
-from airl_mav.experiments.open_executor import open_executor
-from airl_mav.experiments.process_executor import ProcessExecutor
+from airl_mav.experiments.process_executor import ProcessExecutor, open_executor
 from tests.support import worker_jobs
 from tests.support.processes import ROOT, has_ended, is_running, running, wait_until
 

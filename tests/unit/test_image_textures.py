@@ -15,11 +15,10 @@ from PIL import Image
 from airl_mav.arena.appearance import OBSTACLE, TEXTURES, linear_of
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena
-from airl_mav.camera.image_textures import texels_of
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.picture import ColourArrays, antialiased, render_picture
 from airl_mav.camera.primitives import FLOOR
-from airl_mav.camera.textures import SIDE, STRIDE, atlas
+from airl_mav.camera.textures import SIDE, STRIDE, atlas, texels_of
 from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import quat_from_euler
 from airl_mav.envs.colour_images import Looks

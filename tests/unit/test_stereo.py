@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.stereo import Matching, matched_depth, matching_of
+from airl_mav.camera.noise import Matching, matched_depth, matching_of
 from airl_mav.core.errors import UsageError
 from airl_mav.profiles.camera import Stereo
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
