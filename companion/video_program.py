@@ -1,26 +1,260 @@
-"""The video of a camera as a program: opens the camera, sends what it sees, tells who asks."""
+"""The video of a camera as a program: opens the camera, sends what it sees, tells who asks.
+
+MAVLink's camera protocol (https://mavlink.io/en/services/camera.html): QGroundControl and MAVSDK
+find the component by its heartbeat, ask for CAMERA_INFORMATION, and show the stream that
+VIDEO_STREAM_INFORMATION names. It takes no photos, records nothing and stores nothing, and says so.
+"""
 
 from __future__ import annotations
 
+import json
 import math
 import threading
 from collections.abc import Callable
 from contextlib import closing
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
 
 from mavsdk import ComponentType, Mavsdk
+from mavsdk.plugins.mavlink_direct_server import MavlinkDirectServer, MavlinkMessage
 
 from airl_mav.camera.frame import Frame, FurtherImage
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.clock import Clock
+from airl_mav.core.constants import US_PER_MS
 from airl_mav.core.errors import FieldError
 from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.vehicle import VehicleProfile
 from companion.camera import FrameSource, ReceivedFrame
-from companion.camera_component import CameraComponent, Stream
 from companion.cameras.by_name import OpenCamera, open_named_camera
 from companion.mavsdk_connection import open_connection
 from companion.video import RtpVideo, Watcher, picture_of, picture_size
+
+STREAM_ID: Final = 1
+"""Of the only stream; 0 asks for all of them."""
+
+CAMERA_INFORMATION: Final = 259
+CAMERA_SETTINGS: Final = 260
+STORAGE_INFORMATION: Final = 261
+CAMERA_CAPTURE_STATUS: Final = 262
+VIDEO_STREAM_INFORMATION: Final = 269
+VIDEO_STREAM_STATUS: Final = 270
+"""Numbers of the messages that are sent to who asks for them (common.xml)."""
+
+STAMPED: Final = (CAMERA_INFORMATION, CAMERA_SETTINGS, STORAGE_INFORMATION, CAMERA_CAPTURE_STATUS)
+"""Those that say when they were sent."""
+
+REQUEST_MESSAGE: Final = 512
+VIDEO_START_STREAMING: Final = 2502
+VIDEO_STOP_STREAMING: Final = 2503
+"""Commands that are carried out."""
+
+OLD_REQUESTS: Final = {
+    521: CAMERA_INFORMATION,
+    522: CAMERA_SETTINGS,
+    525: STORAGE_INFORMATION,
+    527: CAMERA_CAPTURE_STATUS,
+    2504: VIDEO_STREAM_INFORMATION,
+    2505: VIDEO_STREAM_STATUS,
+}
+"""Commands that asked for one message each, before REQUEST_MESSAGE: clients still send them."""
+
+WITHOUT_EFFECT: Final = (
+    *(526, 529, 530, 531, 532),  # to format the storage, reset, set the mode, zoom, focus
+    *(2000, 2001, 2004, 2005, 2010, 2500, 2501),  # photos, tracking, recording
+)
+"""Commands to cameras that this one does not carry out; MAVSDK would leave them unanswered."""
+
+ACCEPTED, DENIED, UNSUPPORTED = 0, 2, 3
+"""MAV_RESULT."""
+
+HAS_VIDEO_STREAM: Final = 256
+"""CAMERA_CAP_FLAGS."""
+
+MODE_VIDEO: Final = 1
+"""CAMERA_MODE."""
+
+NO_STORAGE: Final = 3
+"""STORAGE_STATUS_NOT_SUPPORTED."""
+
+RTP_UDP: Final = 1
+"""VIDEO_STREAM_TYPE: RTP over UDP, whose URI is the port that is listened on."""
+
+H264: Final = 1
+"""VIDEO_STREAM_ENCODING."""
+
+RUNNING: Final = 1
+"""VIDEO_STREAM_STATUS_FLAGS."""
+
+NAME_BYTES: Final = 32
+
+Fields = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Stream:
+    """What is told of camera and video."""
+
+    model: str
+    """Of the camera; at most 31 characters are told."""
+    size_px: tuple[int, int]
+    """Width and height of the pictures."""
+    rate_hz: float
+    horizontal_fov_deg: float
+    port: int
+    """UDP port that it is sent to."""
+
+
+def camera_information(stream: Stream) -> Fields:
+    """Return the fields of CAMERA_INFORMATION but the time; sizes of the lens are not known: 0."""
+    return {
+        "vendor_name": _bytes("airl-mav"),
+        "model_name": _bytes(stream.model),
+        "firmware_version": 0,
+        "focal_length": 0.0,
+        "sensor_size_h": 0.0,
+        "sensor_size_v": 0.0,
+        "resolution_h": stream.size_px[0],
+        "resolution_v": stream.size_px[1],
+        "lens_id": 0,
+        "flags": HAS_VIDEO_STREAM,
+        "cam_definition_version": 0,
+        "cam_definition_uri": "",
+        "gimbal_device_id": 0,
+    }
+
+
+def stream_status(stream: Stream, *, running: bool) -> Fields:
+    """Return the fields of VIDEO_STREAM_STATUS."""
+    return {
+        "stream_id": STREAM_ID,
+        "flags": RUNNING if running else 0,
+        "framerate": stream.rate_hz,
+        "resolution_h": stream.size_px[0],
+        "resolution_v": stream.size_px[1],
+        "bitrate": 0,  # as much as the quality takes
+        "rotation": 0,
+        "hfov": round(stream.horizontal_fov_deg),
+    }
+
+
+def stream_information(stream: Stream, *, running: bool) -> Fields:
+    """Return the fields of VIDEO_STREAM_INFORMATION."""
+    return {
+        **stream_status(stream, running=running),
+        "count": 1,
+        "type": RTP_UDP,
+        "name": stream.model[: NAME_BYTES - 1],
+        "uri": f"{stream.port}",
+        "encoding": H264,
+    }
+
+
+_NOT_STORING: Final[Fields] = {
+    "storage_id": 0,
+    "storage_count": 0,
+    "status": NO_STORAGE,
+    **dict.fromkeys(("total_capacity", "used_capacity", "available_capacity"), 0.0),
+    **dict.fromkeys(("read_speed", "write_speed"), 0.0),
+}
+_NOT_CAPTURING: Final[Fields] = {
+    "image_status": 0,
+    "video_status": 0,
+    "image_interval": 0.0,
+    "recording_time_ms": 0,
+    "available_capacity": 0.0,
+    "image_count": 0,
+}
+
+
+def _bytes(text: str) -> list[int]:
+    """Return a name as an array of uint8, which is what these fields are."""
+    name = text.encode("ascii", "replace")[: NAME_BYTES - 1]
+    return list(name.ljust(NAME_BYTES, b"\0"))
+
+
+class CameraComponent:
+    """Answers those who ask for the camera, from MAVSDK's own threads."""
+
+    def __init__(self, mavsdk: Mavsdk, stream: Stream, clock: Clock) -> None:
+        """Be there from now on.
+
+        Args:
+            mavsdk: Connected as a component of type camera (`open_connection`).
+            stream: What is told.
+            clock: For the stamps.
+        """
+        self.running = True
+        """Whether the video is wanted: clients may stop it, and start it again."""
+        self._clock = clock
+        self._messages: dict[int, tuple[str, Callable[[], Fields]]] = {
+            CAMERA_INFORMATION: ("CAMERA_INFORMATION", lambda: camera_information(stream)),
+            CAMERA_SETTINGS: ("CAMERA_SETTINGS", lambda: {"mode_id": MODE_VIDEO}),
+            STORAGE_INFORMATION: ("STORAGE_INFORMATION", lambda: _NOT_STORING),
+            CAMERA_CAPTURE_STATUS: ("CAMERA_CAPTURE_STATUS", lambda: _NOT_CAPTURING),
+            VIDEO_STREAM_INFORMATION: (
+                "VIDEO_STREAM_INFORMATION",
+                lambda: stream_information(stream, running=self.running),
+            ),
+            VIDEO_STREAM_STATUS: (
+                "VIDEO_STREAM_STATUS",
+                lambda: stream_status(stream, running=self.running),
+            ),
+        }
+        self._server = MavlinkDirectServer(mavsdk.server_component(0))
+        streaming = (VIDEO_START_STREAMING, VIDEO_STOP_STREAMING)
+        for command in (REQUEST_MESSAGE, *OLD_REQUESTS, *streaming, *WITHOUT_EFFECT):
+            self._server.subscribe_command(command, self._asked)
+
+    def _asked(self, message: MavlinkMessage, _data: object) -> None:
+        fields = json.loads(message.fields_json)
+        # A parameter that is left out is NaN, which JSON has no number for.
+        one, two = (int(fields.get(name) or 0) for name in ("param1", "param2"))
+        sender = message.system_id, message.component_id
+        result, wanted = self._carried_out(int(fields["command"]), one, two)
+        # The acknowledgement is first: whoever asks for a message may wait for that alone.
+        acknowledged = {
+            "command": fields["command"],
+            "result": result,
+            "progress": 0,
+            "result_param2": 0,
+            "target_system": sender[0],
+            "target_component": sender[1],
+        }
+        self._send("COMMAND_ACK", acknowledged, sender)
+        for number in wanted:
+            name, made = self._messages[number]
+            stamp = (
+                {"time_boot_ms": self._clock.time_us() // US_PER_MS} if number in STAMPED else {}
+            )
+            self._send(name, {**stamp, **made()}, sender)
+
+    def _carried_out(self, command: int, one: int, two: int) -> tuple[int, tuple[int, ...]]:
+        """Return the result of a command by its parameters, and the messages that it asks for."""
+        if command in (VIDEO_START_STREAMING, VIDEO_STOP_STREAMING):
+            if one not in (0, STREAM_ID):
+                return DENIED, ()
+            self.running = command == VIDEO_START_STREAMING
+            return ACCEPTED, ()
+        asked = one if command == REQUEST_MESSAGE else OLD_REQUESTS.get(command)
+        if asked not in self._messages:
+            return UNSUPPORTED, ()
+        if asked == CAMERA_INFORMATION:
+            # MAVSDK asks for the stream only 20 s later.
+            return ACCEPTED, (CAMERA_INFORMATION, VIDEO_STREAM_INFORMATION)
+        if asked in (VIDEO_STREAM_INFORMATION, VIDEO_STREAM_STATUS):
+            which = two if command == REQUEST_MESSAGE else one
+            if which not in (0, STREAM_ID):
+                return DENIED, ()
+        return ACCEPTED, (asked,)
+
+    def _send(self, name: str, fields: Fields, to: tuple[int, int]) -> None:
+        self._server.send_message(MavlinkMessage(name, 0, 0, *to, json.dumps(fields)))
+
+    def close(self) -> None:
+        """Be there no more."""
+        self._server.destroy()
+
 
 WAIT_S = 0.5
 """Longest single wait for a frame [wall s]: so soon a wish to end is seen."""

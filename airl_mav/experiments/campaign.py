@@ -17,14 +17,48 @@ from airl_mav.core.progress import Progress
 from airl_mav.experiments.executors import Executor, Stop, WorkerError, never
 from airl_mav.experiments.flier import Flier, FlyEpisodes
 from airl_mav.experiments.live import Ended
-from airl_mav.experiments.lockstep_flier import LockstepFlier
 from airl_mav.experiments.store import CampaignStore
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.rehearsal.episode_saver import EpisodeSaver
 from airl_mav.rehearsal.lock import locked
-from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder, another_config, open_folder
+from airl_mav.rehearsal.run_folder import (
+    FIRMWARE_PRINTS,
+    FlownEpisode,
+    RunFolder,
+    another_config,
+    open_folder,
+)
 from airl_mav.rehearsal.tally import Tally
 from airl_mav.scenario.resolved import PlannedEpisode, ResolvedScenario
+
+
+@dataclass(frozen=True)
+class LockstepFlier:
+    """Level lockstep: one flight at a time in each worker. Implements `Flier`."""
+
+    scenario: ResolvedScenario
+
+    def episodes_per_job(self, episodes: int, workers: int) -> int:  # noqa: ARG002
+        """Return how many episodes make a job; see `Flier`."""
+        return 1
+
+    def start(self, folder: RunFolder, stop: Stop) -> FlyEpisodes:  # noqa: ARG002 (asked between flights)
+        """Load everything; see `Flier`."""
+        # Here: flight controller and MAVSDK are for those who fly, not for those who have it flown.
+        from airl_mav.lockstep.flight import fly
+        from firmware_sim.warm_up import warm_up
+
+        scenario = self.scenario
+        warm_up(scenario.vehicle, scenario.scenario.plant)
+        log = folder.path / FIRMWARE_PRINTS  # of flights side by side, mixed
+
+        def fly_all(episodes: Sequence[PlannedEpisode]) -> Iterator[FlownEpisode]:
+            for episode in episodes:
+                tlog = folder.tlog_path(episode.index) if scenario.scenario.tlogs else None
+                policy = scenario.fresh_policy(episode.seed)
+                yield fly(scenario, policy, episode.index, episode.seed, tlog=tlog, log=log)
+
+        return fly_all
 
 
 def _gym_flier(scenario: ResolvedScenario) -> Flier:

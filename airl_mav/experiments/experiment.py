@@ -17,7 +17,7 @@ from airl_mav.core.progress import Progress
 from airl_mav.experiments.campaign import CampaignRun, Cell, CellRun, run_cells, shared_flights
 from airl_mav.experiments.fly import raise_unless_complete, shown
 from airl_mav.experiments.live import Ended, fly_live, tell_end
-from airl_mav.experiments.open_executor import open_executor
+from airl_mav.experiments.process_executor import open_executor
 from airl_mav.experiments.run import Run
 from airl_mav.experiments.store import CampaignStore, Declaration, DeclaredCell, open_campaign
 from airl_mav.flight.requirements import Requirement

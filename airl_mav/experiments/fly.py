@@ -11,7 +11,7 @@ from airl_mav.core.progress import Progress, RichProgress
 from airl_mav.experiments.campaign import Cell, run_cell
 from airl_mav.experiments.executors import Executor
 from airl_mav.experiments.live import Ended, FlownRun, fly_live, tell_end
-from airl_mav.experiments.open_executor import open_executor
+from airl_mav.experiments.process_executor import open_executor
 from airl_mav.experiments.run import Run
 from airl_mav.rehearsal.rehearsal import RehearsalError
 from airl_mav.rehearsal.signals import stop_on_signals

@@ -3,17 +3,180 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
+from matplotlib.axes import Axes
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+from airl_mav.report import theme
 from airl_mav.report.document import Document, Facts, Headline, Section, provenance_facts
+from airl_mav.report.heatmap import Field, HeatMap, heat_picture
 from airl_mav.report.table import NONE
 from airl_mav.report.theme import Picture
-from airl_mav.sweep.pictures import cost_picture, success_picture, trade_picture
 from airl_mav.sweep.store import SWEEP_FILE, as_data
-from airl_mav.sweep.summary import Sweep, published_best
-from airl_mav.sweep.tables import interval, networks_table, percent
+from airl_mav.sweep.summary import NetworkSummary, Sweep, published_best
+from airl_mav.sweep.tables import count, interval, networks_table, percent, t2_ms
 from airl_mav.sweep.trial import training_of, trials
+
+ASIDE = 1.03
+"""Factor between the dots of one network in two arenas."""
+MARKERS = ("o", "s", "^", "D", "v")
+LABELLED = 20
+"""So many networks get their name in the trade-off; of more, only the best of each arena."""
+
+
+def success_picture(sweep: Sweep, arena: str) -> theme.Picture:
+    """Draw the mean success rate of each network of an arena, with its standard deviation."""
+    best = sweep.best(arena)
+    known = [cell for cell in sweep.of(arena) if cell.success_rate.value is not None]
+    rates = [cell.success_rate.value or 0.0 for cell in known]
+    fields = [
+        Field(100.0 * rate, _success_text(cell), marked=cell is best)
+        for cell, rate in zip(known, rates, strict=True)
+    ]
+    heat = _heat_map(
+        sweep,
+        arena,
+        known,
+        fields,
+        title=arena,
+        unit="success [%]",
+        limits=(min(10.0 * math.floor(10.0 * min(rates, default=0.0)), 90.0), 100.0),
+        note="success, mean ± std over training seeds [%]",
+    )
+    told = ", ".join(f"{cell.network} {percent(cell.success_rate.value)} %" for cell in known)
+    alt = f"Success by layers and filters in {arena}: {told}"
+    return heat_picture(f"sweep-{arena}", alt, heat)
+
+
+def _success_text(cell: NetworkSummary) -> str:
+    text = percent(cell.success_rate.value)
+    if cell.success_std is not None:
+        text += f"\n± {percent(cell.success_std)}"
+    elif len(cell.results) < cell.planned:
+        text += f"\n{len(cell.results)} of {cell.planned}"
+    return text
+
+
+def cost_picture(sweep: Sweep, arena: str) -> theme.Picture:
+    """Draw what each network costs: multiply-accumulates, or the latency estimated from them."""
+    cells = sweep.of(arena)
+    values = [_cost(sweep, cell) for cell in cells]
+    sizes = [f"{count(cell.macs)} MAC" for cell in cells]
+    if sweep.computer is not None:
+        title, unit = f"t2 on {sweep.computer.name}, estimated", "t2, estimated [ms]"
+        note = "from multiply-accumulates"
+        texts = [f"{t2_ms(value)} ms\n{size}" for value, size in zip(values, sizes, strict=True)]
+    else:
+        title, unit = "size", "multiply-accumulates"
+        note = "multiply-accumulates, parameters"
+        texts = [
+            f"{size}\n{count(cell.parameters)} par."
+            for cell, size in zip(cells, sizes, strict=True)
+        ]
+    heat = _heat_map(
+        sweep,
+        arena,
+        cells,
+        [Field(value, text) for value, text in zip(values, texts, strict=True)],
+        title=title,
+        unit=unit,
+        limits=(min(values), max(max(values), 1.01 * min(values))),
+        note=note,
+        logarithmic=True,
+    )
+    alt = f"{heat.title} by layers and filters, {arena}"
+    return heat_picture(f"sweep-size-{arena}", alt, heat)
+
+
+def _heat_map(
+    sweep: Sweep,
+    arena: str,
+    cells: Sequence[NetworkSummary],
+    fields: Sequence[Field],
+    **look: Any,
+) -> HeatMap:
+    """Return the fields of some networks in the grid of an arena."""
+    grid = next(grid for grid in sweep.config.grids if grid.name == arena)
+    return HeatMap(
+        rows=grid.layers,
+        row_title="layers",
+        columns=grid.filters,
+        column_title="filters",
+        fields={(c.layers, c.filters): field for c, field in zip(cells, fields, strict=True)},
+        **look,
+    )
+
+
+def _cost(sweep: Sweep, cell: NetworkSummary) -> float:
+    return cell.t2_ms if sweep.computer is not None and cell.t2_ms is not None else cell.macs
+
+
+def trade_picture(sweep: Sweep) -> theme.Picture:
+    """Draw success against cost: a dot with its interval for each network."""
+    figure = theme.new_figure(7.4, 4.2)
+    ax: Axes = figure.subplots()
+    known = {arena: [c for c in sweep.of(arena) if c.results] for arena in sweep.arenas}
+    many = sum(map(len, known.values())) > LABELLED
+    for number, (arena, cells) in enumerate(known.items()):
+        best = sweep.best(arena)
+        for cell in cells:
+            x = _cost(sweep, cell) * ASIDE ** (number - 0.5 * (len(known) - 1))
+            chosen = best is not None and cell.network == best.network
+            first = arena if cell is cells[0] else None
+            _draw_network(ax, cell, x, number, chosen=chosen, label=first)
+            if chosen or not many:
+                rise = 6 * (len(known) > 1) * (1 - number)
+                ax.annotate(
+                    cell.network,
+                    (x, 100.0 * (cell.success_rate.value or 0.0)),
+                    xytext=(8, rise),
+                    textcoords="offset points",
+                    va="center",
+                    fontsize=8,
+                    color=theme.INK,
+                    zorder=4,
+                )
+    ax.set_xscale("log")
+    # Every 1, 2 and 5 has its number: a grid spans hardly more than a decade.
+    ax.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    ax.xaxis.set_major_formatter(
+        FuncFormatter(lambda v, _: f"{v:g}" if sweep.computer is not None else count(v))
+    )
+    ax.xaxis.set_minor_formatter(NullFormatter())
+    cost = "multiply-accumulates of an inference"
+    if sweep.computer is not None:
+        cost = f"t2 on {sweep.computer.name}, estimated from multiply-accumulates [ms]"
+    theme.label_axes(ax, cost, "success [%], 95 % interval", "What success costs")
+    ax.set_ylim(top=101.5)
+    theme.plain_axes(ax)
+    if len(sweep.arenas) > 1:
+        ax.legend(frameon=False, fontsize=8.5, labelcolor=theme.INK, loc="lower right")
+    return theme.render(figure, "sweep-trade-off", f"Success against {cost}, all networks")
+
+
+def _draw_network(
+    ax: Axes, cell: NetworkSummary, x: float, number: int, *, chosen: bool, label: str | None
+) -> None:
+    """Draw one network of the arena with a number."""
+    rate, colour = cell.success_rate, theme.line_style(number).colour
+    if rate.low is not None and rate.high is not None:
+        ends = [100.0 * rate.low, 100.0 * rate.high]
+        ax.plot([x, x], ends, color=colour, lw=1.4, alpha=0.55)
+    ax.plot(
+        x,
+        100.0 * (rate.value or 0.0),
+        MARKERS[number % len(MARKERS)],
+        ms=8 if chosen else 6,
+        color=colour,
+        mec=theme.MARK if chosen else theme.PAPER,
+        mew=1.8 if chosen else 0.8,
+        label=label,
+        zorder=3,
+    )
 
 
 def document_of(sweep: Sweep) -> Document:

@@ -13,16 +13,22 @@ from __future__ import annotations
 
 import json
 import pickle
+import random
 import shutil
 import warnings
+from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, cast
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import DictReplayBuffer
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import (
@@ -35,7 +41,189 @@ from airl_mav.core.files import (
     sync,
     sync_folder,
 )
-from airl_mav.training.learner_state import collect, restore
+from airl_mav.training.dqn import DoubleDQN
+from airl_mav.training.imitation import Imitation
+
+COUNTERS = (
+    "num_timesteps",
+    "_total_timesteps",
+    "_num_timesteps_at_start",
+    "_episode_num",
+    "_n_updates",
+    "_n_calls",
+    "_current_progress_remaining",
+    "exploration_rate",
+)
+"""Plain numbers of a learner; not every one has all of them."""
+
+NOISE = ("exploration_mat", "exploration_matrices")
+"""What gSDE draws at the beginning of a rollout, before stable-baselines3 says that it begins."""
+
+
+class Restorable(Protocol):
+    """A VecEnv whose state can be saved and restored."""
+
+    def get_state(self) -> Mapping[str, NDArray[Any]]:
+        """Return its whole state by name."""
+        ...
+
+    def set_state(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Restore what `get_state` returned."""
+        ...
+
+
+def collect(model: BaseAlgorithm) -> tuple[dict[str, Any], Arrays, dict[str, Any]]:
+    """Return the state of a learner and its environment: weights, arrays, the rest."""
+    weights: dict[str, Any] = {
+        "states": model.get_parameters(),
+        "variables": {n: attrgetter(n)(model).detach() for n in _variables(model)},
+        "rng": {"cpu": torch.get_rng_state()},
+    }
+    if memory := _memory(model):
+        weights["memory"] = memory
+    if model.use_sde:
+        noise = _explorer(model).action_dist
+        weights["noise"] = {name: getattr(noise, name) for name in NOISE}
+    if model.device.type == "cuda":
+        weights["rng"]["cuda"] = torch.cuda.get_rng_state(model.device)
+    last = cast("Mapping[str, NDArray[Any]]", model._last_obs)
+    arrays = {f"last_obs/{key}": array for key, array in last.items()}
+    arrays["last_episode_starts"] = np.asarray(model._last_episode_starts)
+    arrays |= {f"env/{key}": array for key, array in _env(model).get_state().items()}
+    arrays |= {f"replay/{key}": array for key, array in _get_replay(model).items()}
+    state = {
+        "counters": {name: getattr(model, name) for name in COUNTERS if hasattr(model, name)},
+        "episodes": list(model.ep_info_buffer or ()),
+        "successes": list(model.ep_success_buffer or ()),
+        "random": {
+            "python": random.getstate(),
+            # stable-baselines3 shuffles and explores with the global generator.
+            "numpy": np.random.get_state(legacy=False),  # noqa: NPY002
+            "generators": [each.bit_generator.state for each in _generators(model)],
+        },
+    }
+    return weights, arrays, state
+
+
+def restore(
+    model: BaseAlgorithm, weights: dict[str, Any], arrays: Arrays, state: dict[str, Any]
+) -> None:
+    """Restore what `collect` returned.
+
+    Raises:
+        KeyError, RuntimeError, ValueError: It is of a learner of another specification.
+    """
+    model.set_parameters(weights["states"], exact_match=True, device=model.device)
+    for name in _variables(model):
+        attrgetter(name)(model).data.copy_(weights["variables"][name])
+    for ours, saved in zip(_memory(model), weights.get("memory", []), strict=True):
+        if ours.shape != saved.shape:
+            raise ValueError(f"memory of shape {tuple(saved.shape)}, not {tuple(ours.shape)}")
+        ours.copy_(saved)
+    if model.use_sde:
+        _restore_noise(model, weights["noise"])
+    starts = arrays["last_episode_starts"]
+    if starts.shape != (model.n_envs,):
+        raise ValueError(f"{len(starts)} vehicles, not {model.n_envs}")
+    model._last_obs = _below("last_obs/", arrays)
+    model._last_episode_starts = starts
+    _set_replay(model, _below("replay/", arrays))
+    _env(model).set_state(_below("env/", arrays))
+    for name, value in state["counters"].items():
+        setattr(model, name, value)
+    window = model._stats_window_size
+    model.ep_info_buffer = deque(state["episodes"], maxlen=window)
+    model.ep_success_buffer = deque(state["successes"], maxlen=window)
+    # Last: what came before may have drawn.
+    version, internal, gauss = state["random"]["python"]
+    random.setstate((version, tuple(internal), gauss))
+    np.random.set_state(state["random"]["numpy"])  # noqa: NPY002
+    for generator, saved in zip(_generators(model), state["random"]["generators"], strict=True):
+        generator.bit_generator.state = saved
+    torch.set_rng_state(weights["rng"]["cpu"])
+    if model.device.type == "cuda":
+        torch.cuda.set_rng_state(weights["rng"]["cuda"], model.device)
+
+
+def _variables(model: BaseAlgorithm) -> list[str]:
+    return model._get_torch_save_params()[1]
+
+
+def _memory(model: BaseAlgorithm) -> list[torch.Tensor]:
+    """Return what a recurrent learner's networks remember of the flights that go on."""
+    states = getattr(model, "_last_lstm_states", None)
+    return [] if states is None else [each for pair in states for each in pair]
+
+
+def _explorer(model: BaseAlgorithm) -> Any:
+    """Return the part of a policy that draws gSDE's noise."""
+    return getattr(model, "actor", None) or model.policy
+
+
+def _restore_noise(model: BaseAlgorithm, saved: Mapping[str, torch.Tensor]) -> None:
+    """Put gSDE's noise back; the draw with which the next rollout begins has been made."""
+    explorer = _explorer(model)
+    for name in NOISE:
+        setattr(explorer.action_dist, name, saved[name].to(model.device))
+
+    def once(n_envs: int = 1) -> None:  # noqa: ARG001 (the signature of what it stands for)
+        del explorer.reset_noise
+
+    explorer.reset_noise = once
+
+
+def _generators(model: BaseAlgorithm) -> list[np.random.Generator]:
+    """Return the generators that a learner draws from, beside the global ones."""
+    own = getattr(model, "generator", None)
+    return [model.action_space.np_random, *([] if own is None else [own])]
+
+
+def _env(model: BaseAlgorithm) -> Restorable:
+    if not hasattr(model.env, "get_state"):
+        raise TypeError(f"{type(model.env).__name__} has no get_state/set_state")
+    return cast("Restorable", model.env)
+
+
+def _below(prefix: str, arrays: Arrays) -> Arrays:
+    return {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
+
+
+def _get_replay(model: BaseAlgorithm) -> Arrays:
+    """Return the filled part of a learner's replay memory by name; nothing when it has none."""
+    if isinstance(model, DoubleDQN | Imitation):
+        return model.replay.get_state()
+    buffer = _stock_buffer(model)
+    if buffer is None:
+        return {}
+    filled = buffer.buffer_size if buffer.full else buffer.pos
+    arrays = {name: array[:filled] for name, array in _stock_arrays(buffer).items()}
+    return arrays | {"pos": np.array(buffer.pos), "full": np.array(buffer.full)}
+
+
+def _set_replay(model: BaseAlgorithm, saved: Mapping[str, NDArray[Any]]) -> None:
+    """Put back what `_get_replay` gave. Raises ValueError when it is of another size."""
+    if isinstance(model, DoubleDQN | Imitation):
+        model.replay.set_state(saved)
+        return
+    buffer = _stock_buffer(model)
+    if buffer is None:
+        return
+    for name, array in _stock_arrays(buffer).items():
+        array[: len(saved[name])] = saved[name]
+    buffer.pos, buffer.full = int(saved["pos"]), bool(saved["full"])
+
+
+def _stock_buffer(model: BaseAlgorithm) -> DictReplayBuffer | None:
+    buffer = model.replay_buffer if isinstance(model, OffPolicyAlgorithm) else None
+    return buffer if isinstance(buffer, DictReplayBuffer) else None
+
+
+def _stock_arrays(buffer: DictReplayBuffer) -> Arrays:
+    names = ("actions", "rewards", "dones", "timeouts")
+    arrays: Arrays = {name: getattr(buffer, name) for name in names}
+    arrays |= {f"observations/{key}": array for key, array in buffer.observations.items()}
+    return arrays | {f"next/{key}": array for key, array in buffer.next_observations.items()}
+
 
 SCHEMA = 1
 KEEP = 2

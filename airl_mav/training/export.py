@@ -31,8 +31,13 @@ from airl_mav.policy.layouts import GOAL, IN_FLIGHT, VELOCITY, boxes
 from airl_mav.policy.observation_spec import ObservationSpec
 from airl_mav.policy.runtime import first_line
 from airl_mav.profiles.camera_kind import CHANNELS, KINDS
-from airl_mav.training.export_request import ExportRequest, Taken
-from airl_mav.training.normalised import Normalised, load_normalisation, normalised_keys
+from airl_mav.training.export_request import (
+    ExportRequest,
+    Normalised,
+    Taken,
+    load_normalisation,
+    normalised_keys,
+)
 from airl_mav.training.onnx_export import (
     TOLERANCE,
     export_network,

@@ -11,16 +11,18 @@ from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.save_util import load_from_zip_file
 
 from airl_mav.core.clock import WallClock, utc_now
 from airl_mav.core.constants import US_PER_S
-from airl_mav.core.errors import FieldError
+from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.files import replace_file
 from airl_mav.core.provenance import package_versions
 from airl_mav.envs.decisions import FIRST_TRAINING_SEED, LAST_TRAINING_SEED
@@ -44,10 +46,42 @@ from airl_mav.training.config import (
     kind_of,
 )
 from airl_mav.training.export import export_sb3
-from airl_mav.training.initial import begin_with
 from airl_mav.training.recurrent import GreedyDecisions
 from airl_mav.training.store import BEST_MODEL, Evaluation, TrainingFolder, TrainingProgress
 from airl_mav.view.ends import ViewEnds
+
+
+def begin_with(model: BaseAlgorithm, run: Path, log_std: float | None = None) -> None:
+    """Give a learner the best weights of a training run; its optimiser begins afresh.
+
+    Weights are all that the networks of a learner hold: the value's and the exploration's too.
+
+    Args:
+        model: A learner of the same algorithm, with the same inputs, network and actions.
+        run: Folder of the training run, of which the newest evaluation may still be to come.
+        log_std: Logarithm of the standard deviation of continuous actions to begin with; None:
+            the run's. What an expert has taught knows none.
+
+    Raises:
+        UsageError: There is no run, it has not been evaluated yet, or its weights do not fit.
+    """
+    folder = TrainingFolder(run)
+    learned = folder.about()["config"]["algorithm"]["name"]
+    if folder.best() is None:
+        raise UsageError(f"initial = '{run}': no weights yet; accepted: a run that was evaluated")
+    # Only tensors are read: nothing is unpickled.
+    _, states, _ = load_from_zip_file(folder.best_model, device=model.device, load_data=False)
+    try:
+        # stable-baselines3 calls a network's state a tensor.
+        model.policy.load_state_dict(cast("dict[str, Any]", states["policy"]))
+    except RuntimeError:
+        raise UsageError(
+            f"initial = '{run}': weights of {learned!r} that do not fit; accepted: a run with the"
+            " same algorithm, network, observation and actions"
+        ) from None
+    if log_std is not None:
+        cast("ActorCriticPolicy", model.policy).log_std.data.fill_(log_std)
+
 
 RECENT = 200
 """Episodes in training that the shown success rate is of."""

@@ -9,15 +9,57 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from airl_mav.core.frames import Geodetic
-from firmware_sim.autopilot.autopilot_state import Message, Severity
-from firmware_sim.autopilot.commander import Flight
-from firmware_sim.external.heartbeat_modes import flight_of
+from firmware_sim.autopilot.autopilot_state import Message, Mode, Severity
+from firmware_sim.autopilot.commander import Flight, Phase
+from firmware_sim.autopilot.mode_numbers import custom_mode
 from firmware_sim.external.parameter_client import ParameterClient
 from firmware_sim.mavlink.codec import Decoder, Encoder, WireMessage, dialect, message_id
 from firmware_sim.mavlink.endpoint import Endpoint
 from firmware_sim.mavlink.link import LinkCounters
 from firmware_sim.mavlink.streams import units
 from firmware_sim.mavlink.tlog import TlogWriter
+
+# PX4 reports Descend as Land.
+_PX4_MODES = {custom_mode(mode): mode for mode in Mode if mode is not Mode.DESCEND}
+
+# ArduCopter's mode numbers: ArduCopter/mode.h, enum class Number.
+GUIDED = 4
+_ARDUCOPTER_MODES = {
+    3: Mode.TAKEOFF,  # AUTO: a mission
+    GUIDED: Mode.OFFBOARD,
+    5: Mode.HOLD,  # LOITER
+    6: Mode.RETURN,
+    9: Mode.LAND,
+    17: Mode.HOLD,  # BRAKE
+}
+
+_IN_AIR = (
+    dialect.MAV_LANDED_STATE_IN_AIR,
+    dialect.MAV_LANDED_STATE_TAKEOFF,
+    dialect.MAV_LANDED_STATE_LANDING,
+)
+
+
+def flight_of(
+    autopilot: int, custom_mode: int, landed_state: int, *, armed: bool, ready: bool
+) -> Flight:
+    """Return phase and mode by the fields of HEARTBEAT and EXTENDED_SYS_STATE.
+
+    `armed`: motors may turn; `ready`: it may be armed.
+    """
+    if autopilot == dialect.MAV_AUTOPILOT_ARDUPILOTMEGA:
+        mode = _ARDUCOPTER_MODES.get(custom_mode, Mode.POSITION)
+        # GUIDED takes off as well: coming from the ground is no flight by setpoints.
+        if mode is Mode.OFFBOARD and landed_state == dialect.MAV_LANDED_STATE_TAKEOFF:
+            mode = Mode.TAKEOFF
+    else:
+        mode = _PX4_MODES.get(custom_mode, Mode.POSITION)
+    if not armed:
+        phase = Phase.STANDBY if ready else Phase.BOOT
+    else:
+        phase = Phase.AIR if landed_state in _IN_AIR else Phase.GROUND
+    return Flight(phase=phase, mode=mode, intended=mode, after_disarm=mode)
+
 
 SYSTEM_ID = 254
 """MAVLink system id of the observer: neither the vehicle's nor a ground station's (255)."""

@@ -1,20 +1,138 @@
 """The process of external firmware and its working folders, behind the parent-death guard.
 
 Neither PX4 nor ArduPilot ends by itself when its simulator is gone.
+
+Where the operating system does not tell (/proc is Linux's), nothing is known of it.
 """
 
 from __future__ import annotations
 
 import os
+import select
 import shutil
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+import psutil
+
 from airl_mav.core.child_process import ChildProcess
+from airl_mav.core.clock import Patience
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
+
+REST_LIMIT_S = 1.0
+"""Longest wait for all threads to be at rest [wall s]: one that never is must not stop a flight."""
+
+LOOKS = 2
+"""So many looks in a row find all threads asleep before they are taken to be: between the looks at
+two threads one may have woken the other."""
+
+PAUSE_S = 1e-4
+"""Between two looks while a thread is at work [wall s]: it may need the core that we are on."""
+
+_STATE_BYTES = 80
+"""Of a thread's `stat`, enough to hold its number, name and state."""
+
+
+class RunningProgram:
+    """One process."""
+
+    def __init__(self, pid: int, watched: Collection[bytes]) -> None:
+        """Take its process id, and the names of the threads that `settle` waits for."""
+        self.pid = pid
+        self._watched = frozenset(watched)
+        self._threads: list[int] | None = None
+        """Descriptor of the `stat` of each thread that is waited for; None: not looked for yet."""
+
+    @property
+    def stopped(self) -> bool:
+        """Whether it was stopped by a signal: SIGSTOP, SIGTSTP."""
+        try:
+            return bool(psutil.Process(self.pid).status() == psutil.STATUS_STOPPED)
+        except psutil.Error:
+            return False
+
+    def settle(self) -> bool:
+        """Return once the threads sleep, having done all that there is to do for now.
+
+        They are looked for at the first call: they must be there by then.
+
+        Returns:
+            Whether they do; False where that cannot be known, or took too long.
+        """
+        patience, looks = Patience(), 0
+        while looks < LOOKS:
+            asleep = self._all_asleep()
+            if asleep is None:
+                return False
+            if asleep:
+                looks += 1
+                continue
+            looks = 0
+            if patience.so_far_s() > REST_LIMIT_S:
+                return False
+            select.select([], [], [], PAUSE_S)
+        return True
+
+    def close(self) -> None:
+        """Forget it; harmless when called again."""
+        for descriptor in self._threads or ():
+            os.close(descriptor)
+        self._threads = []
+
+    def _all_asleep(self) -> bool | None:
+        """Return whether none of the threads is at work right now; None where nobody knows."""
+        try:
+            if self._threads is None:
+                self._threads = self._found()
+            for descriptor in self._threads:
+                if _state(os.pread(descriptor, _STATE_BYTES, 0)) != b"S":
+                    return False
+        except OSError:  # There is no /proc, or the program has ended.
+            return None
+        return True
+
+    def _found(self) -> list[int]:
+        """Return what tells of each thread that is waited for."""
+        found = []
+        for thread in Path(f"/proc/{self.pid}/task").iterdir():
+            descriptor = os.open(thread / "stat", os.O_RDONLY | os.O_CLOEXEC)
+            if _name(os.pread(descriptor, _STATE_BYTES, 0)) in self._watched:
+                found.append(descriptor)
+            else:
+                os.close(descriptor)
+        return found
+
+
+def program_at(host: str, port: int, to_port: int) -> int | None:
+    """Return the process id of whose TCP connection this is; None: not known.
+
+    Nobody is found among the processes of other users, nor on other machines.
+
+    Args:
+        host: Its address, as it is seen from here.
+        port: Its port.
+        to_port: The port that it has connected to: its own may be another program's, too, for a
+            connection to somewhere else.
+    """
+    with suppress(psutil.Error, OSError):
+        for connection in psutil.net_connections("tcp4"):
+            own, other = connection.laddr, connection.raddr
+            if own and other and tuple(own) == (host, port) and other.port == to_port:
+                return None if connection.pid in (None, os.getpid()) else int(connection.pid)
+    return None
+
+
+def _state(stat: bytes) -> bytes:
+    """Return the state of a thread. Source: proc_pid_stat(5), field 3."""
+    end = stat.rindex(b")")
+    return stat[end + 2 : end + 3]
+
+
+def _name(stat: bytes) -> bytes:
+    return stat[stat.index(b"(") + 1 : stat.rindex(b")")]
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,13 @@ from hypothesis import strategies as st
 from airl_mav.core.errors import UsageError
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.autopilot_state import Result
-from firmware_sim.external.ardupilot.json_messages import ServoPacketError, parse_servos, state_line
-from firmware_sim.external.ardupilot.sitl import MAX_GARBAGE, ArdupilotBridge
+from firmware_sim.external.ardupilot.sitl import (
+    MAX_GARBAGE,
+    ArdupilotBridge,
+    ServoPacketError,
+    parse_servos,
+    state_line,
+)
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
 from firmware_sim.interfaces import ActuatorControls, BatterySample, SensorSample, Truth
 from tests.support.ardupilot_copter import GUIDED, LAND

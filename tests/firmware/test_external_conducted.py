@@ -25,12 +25,11 @@ from firmware_sim.external import conducted as conducted_module
 from firmware_sim.external.airframe_check import SITL_OUTPUT, px4_airframe
 from firmware_sim.external.conducted import conducted_px4
 from firmware_sim.external.launcher import Launcher
-from firmware_sim.external.process import StartCommand, WorkingFolders
+from firmware_sim.external.process import RunningProgram, StartCommand, WorkingFolders, program_at
 from firmware_sim.external.px4 import onboard_link as link_module
 from firmware_sim.external.px4.onboard_link import OnboardLink
 from firmware_sim.external.px4.program import API_LOCAL_PORT, SIMULATOR_PORT, check_free
 from firmware_sim.external.px4.sitl import EPOCH_US, Px4Bridge
-from firmware_sim.external.running_program import RunningProgram, program_at
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
 from firmware_sim.mavlink.codec import Decoder, Encoder, dialect
 from firmware_sim.plant.plant import Plant
@@ -200,7 +199,7 @@ def name_of(child: subprocess.Popen[bytes]) -> bytes:
 
 @NEEDS_PROC
 def test_a_program_at_rest_and_one_at_work(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("firmware_sim.external.running_program.REST_LIMIT_S", 0.1)
+    monkeypatch.setattr("firmware_sim.external.process.REST_LIMIT_S", 0.1)
     with program("print(flush=True); input()") as resting:
         seen = RunningProgram(resting.pid, [name_of(resting)])
         for _ in range(1000):

@@ -15,7 +15,7 @@ from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.errors import FieldError
 from airl_mav.core.frames import Vector, geodetic_to_local, quat_wxyz_to_xyzw, quat_yaw
 from airl_mav.core.location import HOME
-from airl_mav.experiments.fault_flight import fly_fault
+from airl_mav.experiments.fault_matrix import fly_fault
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve

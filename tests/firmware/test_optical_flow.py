@@ -16,7 +16,7 @@ from airl_mav.core.constants import TICK_S
 from airl_mav.core.errors import FieldError
 from airl_mav.core.frames import Vector
 from airl_mav.core.location import HOME
-from airl_mav.experiments.fault_flight import fly_fault
+from airl_mav.experiments.fault_matrix import fly_fault
 from airl_mav.faults.catalogue import FITTED_CASES, Case
 from airl_mav.profiles.sensors import OpticalFlow as Profile
 from airl_mav.profiles.vehicle import load_vehicle

@@ -20,7 +20,7 @@ from airl_mav.experiments.campaign import CampaignRun, Cell, CellRun, run_cell, 
 from airl_mav.experiments.executors import ExecutorSettings, InProcessExecutor
 from airl_mav.experiments.experiment import Experiment, run_experiment
 from airl_mav.experiments.fly import fly_scenario
-from airl_mav.experiments.open_executor import open_executor
+from airl_mav.experiments.process_executor import open_executor
 from airl_mav.experiments.store import (
     Declaration,
     DeclaredCell,

@@ -11,8 +11,14 @@ from rich.console import Console
 from airl_mav.cli import faults
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.experiments import fault_matrix
-from airl_mav.experiments.fault_flight import FaultFlight, fly_fault
-from airl_mav.experiments.fault_matrix import Cell, cell_text, fly_matrix, markdown
+from airl_mav.experiments.fault_matrix import (
+    Cell,
+    FaultFlight,
+    cell_text,
+    fly_fault,
+    fly_matrix,
+    markdown,
+)
 from airl_mav.faults.catalogue import CASES, FALLS, MATRIX_PHASES, End
 from airl_mav.faults.kinds import Phase
 from airl_mav.faults.model import Fault

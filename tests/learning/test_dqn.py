@@ -14,8 +14,7 @@ from stable_baselines3.common.logger import configure
 
 from airl_mav.training.algorithms import make_model
 from airl_mav.training.config import AlgorithmSpec, NetworkSpec
-from airl_mav.training.dqn import DoubleDQN
-from airl_mav.training.replay import NStepReplay
+from airl_mav.training.dqn import DoubleDQN, NStepReplay
 from tests.support.toy_fleet import ToyFleet
 
 SHAPES: dict[str, tuple[tuple[int, ...], np.dtype[Any]]] = {

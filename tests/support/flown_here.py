@@ -8,7 +8,7 @@ from unittest.mock import patch
 
 from airl_mav.experiments import experiment, fly
 from airl_mav.experiments.executors import Executor
-from airl_mav.experiments.open_executor import open_executor
+from airl_mav.experiments.process_executor import open_executor
 from airl_mav.scenario.model import Workers
 
 

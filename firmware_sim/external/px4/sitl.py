@@ -12,9 +12,9 @@ from collections.abc import Callable
 from airl_mav.core.clock import Patience, WallClock
 from airl_mav.core.constants import TICK_HZ, TICK_US, US_PER_S
 from firmware_sim.external.bridge import no_process
+from firmware_sim.external.process import RunningProgram, program_at
 from firmware_sim.external.px4 import hil_messages as hil
 from firmware_sim.external.px4.program import MODEL, SIMULATOR_PORT, UNAWAITED_THREADS
-from firmware_sim.external.running_program import RunningProgram, program_at
 from firmware_sim.external.transport.tcp_port import WATCH_S, TcpPort
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
 from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth
