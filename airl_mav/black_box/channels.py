@@ -19,10 +19,9 @@ UNKNOWN = "null: not known"
 
 
 def foxglove_schema(kind: type[Any]) -> dict[str, Any]:
-    """Return the schema of a message's class: an object, written out in one piece.
+    """Return the JSON schema of a message class without references.
 
-    What may be null has the type that it has otherwise, and says so in its description. Elements
-    of a tuple are of one type.
+    Nullable fields keep their type and say so in the description; tuples have one element type.
     """
     schema = TypeAdapter(kind).json_schema()
     return _plain(schema, schema.get("$defs", {}))

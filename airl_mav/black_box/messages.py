@@ -249,10 +249,9 @@ ENCODINGS: dict[str, tuple[str, int]] = {
 
 
 def image_message(image: NDArray[Any], unix_us: int, camera: str = "camera") -> RawImage:
-    """Return the message of a camera's image, taken at a calendar time [µs].
+    """Return the message of a depth (h, w) [mm] or colour (h, w, c) image at a calendar time [µs].
 
-    It is depth (height, width) [mm], or colour (height, width, channels). A further camera has its
-    own name, and its own topic: that of the main one, a slash and the name.
+    The topic of an additional camera is the main one, a slash and its name.
     """
     height, width, *channels = image.shape
     encoding = "mono16" if not channels else "rgb8" if channels == [3] else "mono8"
@@ -262,11 +261,7 @@ def image_message(image: NDArray[Any], unix_us: int, camera: str = "camera") -> 
 
 
 def image_of(image: RawImage) -> NDArray[Any]:
-    """Return the image of a message, as `image_message` takes it.
-
-    Raises:
-        ValueError: Its data does not have its size, or its encoding is not known.
-    """
+    """Return the image of a message; raise ValueError for a wrong size or unknown encoding."""
     if image.encoding not in ENCODINGS:
         raise ValueError(f"encoding {image.encoding!r}; accepted: {', '.join(ENCODINGS)}")
     number, channels = ENCODINGS[image.encoding]

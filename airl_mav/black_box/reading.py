@@ -75,11 +75,7 @@ class BlackBox:
 
 
 def read_black_box(path: Path) -> BlackBox:
-    """Read a black box, up to where it ends or is damaged.
-
-    Raises:
-        UsageError: It cannot be read, or is none of ours.
-    """
+    """Read a black box up to its end or first damage; UsageError if it is none."""
     box = None
     try:
         with path.open("rb") as file:
@@ -103,9 +99,9 @@ def read_black_box(path: Path) -> BlackBox:
 
 
 def _whole_records(reader: StreamReader) -> Iterator[Any]:
-    """Give metadata, the end, and messages with their kinds, up to the first torn record.
+    """Yield metadata, the end, and messages with their kinds, up to the first torn record.
 
-    A wrong checksum of all records is given in place of the end.
+    A wrong checksum of all records replaces the end.
     """
     kinds = {topic: kind for kind, topic in TOPICS.items()}
     adapters: dict[int, tuple[type[Message], TypeAdapter[Any]]] = {}

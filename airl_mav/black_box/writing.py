@@ -26,16 +26,10 @@ class McapFile:
     """An MCAP file with the messages of a flight."""
 
     def __init__(self, file: IO[bytes], run: Mapping[str, Any], *, in_chunks: bool = True) -> None:
-        """Begin the file.
+        """Begin an empty file; `run` is the content of `run.json`.
 
-        Args:
-            file: An open file, empty.
-            run: What flies, as `run.json` has it.
-            in_chunks: Compressed and indexed, so that a viewer can jump to any time; otherwise
-                every message can be read as soon as it is on the disk.
-
-        Raises:
-            OSError: It cannot be written.
+        Chunks are compressed and indexed, so that viewers can seek; without chunks every message is
+        readable as soon as it is on the disk.
         """
         self._writer = Writer(
             file,
@@ -80,15 +74,7 @@ class BlackBoxFile(McapFile):
     """
 
     def __init__(self, path: Path, run: Mapping[str, Any]) -> None:
-        """Open a new file.
-
-        Args:
-            path: Its name, of no file that is there.
-            run: What flies, as `run.json` has it.
-
-        Raises:
-            OSError: It cannot be opened or written, or is there already.
-        """
+        """Open a new file; raise OSError if it exists or cannot be written."""
         self.path = path
         self._file = path.open("xb")
         super().__init__(self._file, run, in_chunks=False)

@@ -109,10 +109,10 @@ class Checklist:
         self.checks: list[Check] = []
 
     def perform(self, name: str, check: Callable[[], str]) -> bool:
-        """Make a check and return whether it did not fail.
+        """Run a check and return whether it did not fail.
 
-        The check returns its finding, or raises CheckFailedError or NotApplicableError. LinkError
-        and KeyboardInterrupt are noted as failed and raised again.
+        It returns its finding, or raises CheckFailedError or NotApplicableError. LinkError and
+        KeyboardInterrupt are recorded as failures and raised again.
         """
         start_s = self._transcript.time_s
         try:

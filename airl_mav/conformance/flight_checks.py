@@ -193,10 +193,10 @@ def _react(stream: SetpointStream, setpoint: RawSetpoint, vehicle: Vehicle) -> s
 
 
 def _nan_velocity(stream: SetpointStream, vehicle: Vehicle) -> str:
-    """Send a velocity of NaN: it is neither flown nor counts as a loss of setpoints.
+    """Send a NaN velocity: it is ignored and does not count as a loss of setpoints.
 
-    Judged by the mean velocity of the last second: ArduCopter starts its mode anew with each such
-    setpoint, and swings about its place with up to 0.6 m/s.
+    Judged by the last second's mean velocity: ArduCopter restarts its mode with each such setpoint
+    and swings by up to 0.6 m/s.
     """
     stream.send(RawSetpoint(MavFrame.LOCAL_NED, VELOCITY, vx=None))
     vehicle.transcript.add("sent", "SET_POSITION_TARGET_LOCAL_NED vx NaN for 2 s")

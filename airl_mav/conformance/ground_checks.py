@@ -63,10 +63,7 @@ def heartbeat(vehicle: Vehicle) -> str:
 
 
 def require_answer(vehicle: Vehicle, result: int, expected: ExpectedAnswer, since: int) -> str:
-    """Return the finding of a MAV_RESULT; `since` is the number of texts before the question.
-
-    Raises CheckFailedError if it is not the expected answer.
-    """
+    """Return the finding of the expected MAV_RESULT; otherwise raise CheckFailedError."""
     name = name_of(MavResult, result)
     require(result == expected.result, f"{name}, not {expected.result.name}")
     if not expected.text:

@@ -119,10 +119,7 @@ def judge(measured: MeasuredStep | None, reference: Reference) -> str:
 
 
 def load_reference(name: str, autopilot: int) -> Reference:
-    """Return a stored column: `auto` (by HEARTBEAT.autopilot), a shipped name, a path to a .toml.
-
-    Raises UsageError if there is none, or it cannot be used.
-    """
+    """Return stored steps: `auto` (by HEARTBEAT.autopilot), a name or path; UsageError if none."""
     if name != AUTO:
         return load_profile("conformance", name, Reference)
     for shipped in list_profiles("conformance"):

@@ -53,14 +53,7 @@ class _Flown(BaseModel):
 
 
 def load_steps(source: str) -> Mapping[StepName, StoredStep]:
-    """Return the step responses of a stored reference, or of a result of `airl conformance`.
-
-    Args:
-        source: Name or path (.toml) of a stored reference, or path (.json) of a result.
-
-    Raises:
-        UsageError: There is none, or it cannot be used.
-    """
+    """Return the steps of a stored reference (name, .toml) or a result (.json); else UsageError."""
     path = Path(source)
     if path.suffix != ".json":
         return load_profile("conformance", source, Reference).steps
@@ -78,11 +71,11 @@ def load_steps(source: str) -> Mapping[StepName, StoredStep]:
 def fit_response(steps: Mapping[StepName, StoredStep], vehicle: VehicleProfile) -> Response:
     """Return the response of a vehicle that flew such steps.
 
-    Its dead time is that of the velocity. The yaw rate, which follows sooner, has one of its own in
-    the fit, so that its time constant is right. What the vehicle leans against is its linear drag.
+    The dead time is that of the velocity; the yaw rate is fitted with its own, shorter one, so that
+    its time constant is right. Lean at constant velocity gives the linear drag.
 
     Raises:
-        UsageError: No velocity step got to 90 %, or the step of the yaw rate did not.
+        UsageError: A velocity step or the yaw rate's did not reach 90 %.
     """
     dead_s, lag_s = _lag(steps, VELOCITY_STEPS)
     _, turn_lag_s = _lag(steps, (YAW_RATE_STEP,))

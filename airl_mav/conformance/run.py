@@ -48,28 +48,26 @@ def check_conformance(
 ) -> ConformanceResult:
     """Fly a flight controller through all checks and step responses. It takes off.
 
-    Whatever fails, the vehicle is landed first. Ctrl-C (KeyboardInterrupt) lands it too: the
-    result is then `interrupted`.
+    After any failure and after Ctrl-C the vehicle lands; an interrupted result is `interrupted`.
 
     Args:
         connect: MAVSDK connection, udpin://HOST:PORT or serial://DEVICE:BAUD.
-        reference: Stored step responses: auto (by the autopilot), px4, ardupilot, or a path to a
-            .toml.
+        reference: Stored step responses: auto (by the autopilot), px4, ardupilot, or a path
+            (.toml).
         speed: Simulated seconds per wall second of the vehicle, 0.01 to 100; 1 for a real one.
         altitude_m: Take-off altitude, 8 to 100, with `steps_only` from 2 [m].
-        steps: Names of the steps to fly; none: ().
-        repeat: How often the steps are flown, 1 to 20; every other time mirrored.
-        steps_only: Whether refusals, frames, offboard loss and hold are left out.
-        connect_timeout_s: Longest wait for a flight controller, 1 to 3600 [wall s].
-        progress: Called with each line of the transcript as it is added, by any thread.
+        steps: Names of the steps to fly.
+        repeat: Repetitions of the steps, 1 to 20; every second one mirrored.
+        steps_only: Skip refusals, frames, offboard loss and hold.
+        connect_timeout_s: Timeout for finding a flight controller, 1 to 3600 [wall s].
+        progress: Called with each line of the transcript, by any thread.
 
     Returns:
         All checks, step responses and the transcript.
 
     Raises:
-        UsageError: A value is out of range, the connection is invalid or its port taken, nobody
-            is heard, or the autopilot or the stored column is not known. Nothing has been
-            commanded then.
+        UsageError: Invalid value or connection, port taken, no heartbeat, or unknown autopilot;
+            nothing was commanded.
     """
     settings = Settings(
         connect, reference, speed, altitude_m, tuple(steps), repeat, steps_only, connect_timeout_s

@@ -131,18 +131,17 @@ def step_response(
     after: float,
     change: float,
 ) -> StepResponse:
-    """Return what a step looks like.
+    """Return the characteristics of a step.
 
     Args:
-        times_s: (n,) when the values were true, from the moment of sending; < 0 is before it [s].
-        values: (n,) what was to step [unit].
+        times_s: (n,) times of the values since sending; < 0 is before it [s].
+        values: (n,) values [unit].
         before: Old setpoint [unit].
-        after: New setpoint, another one [unit].
-        change: Movement towards the new value that ends the latency, from the mean of what was
-            before the step, > 0 [unit].
+        after: New setpoint, different from the old [unit].
+        change: Movement that ends the latency, from the mean before the step, > 0 [unit].
 
     Raises:
-        ValueError: There is nothing from before the step, or nothing from after it.
+        ValueError: There are no values before or after the step.
     """
     quiet, answer = times_s < 0.0, times_s >= 0.0
     if not quiet.any() or not answer.any():
@@ -180,10 +179,9 @@ class MeasuredStep(NamedTuple):
 
     @property
     def median(self) -> StepResponse:
-        """Median over the repetitions, figure by figure; NaN where one did not get there.
+        """Median of each figure over the repetitions; NaN where one did not get there.
 
-        Not their mean: now and then noise of the estimate alone makes a movement, long before the
-        step does.
+        A mean would be dominated by estimator noise that looks like an early movement.
         """
         return StepResponse(*np.median(np.array(self.flights), axis=0).tolist())
 
@@ -242,10 +240,10 @@ def plan(names: tuple[StepName, ...], *, mirrored: bool) -> list[Leg]:
 
 
 def measure(step: Step, motion: Motion, sent_s: float) -> StepResponse:
-    """Return the response to a step, from the motion of `BEFORE_S` before it to its leg's end.
+    """Return a step's response from `BEFORE_S` before it to its end; `sent_s` is its arrival [s].
 
-    `sent_s` is when the setpoint reached the vehicle, by its clock [s]. Raises ValueError if
-    telemetry is missing before or after the step.
+    Raises:
+        ValueError: Telemetry is missing before or after the step.
     """
     position, heading = motion
     velocity, times_s = motion.velocity, position[:, 0]

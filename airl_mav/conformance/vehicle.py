@@ -115,10 +115,7 @@ class Vehicle:
     # --- commands
 
     def call(self, what: str, call: Callable[[], Any], *, must_succeed: bool = False) -> str:
-        """Make a call into MAVSDK; return "" when it succeeded, else the result's name.
-
-        Raises LinkError when it is refused and must succeed.
-        """
+        """Call MAVSDK; return "" or the result's name; LinkError if it fails and `must_succeed`."""
         self.transcript.add("sent", what)
         try:
             call()
@@ -132,10 +129,7 @@ class Vehicle:
         return ""
 
     def command(self, number: int, *params: float, note: str = "") -> int:
-        """Send a COMMAND_LONG, repeat it while it is not answered, and return its MAV_RESULT.
-
-        Parameters that are left out are 0. Raises LinkError without an answer.
-        """
+        """Send a COMMAND_LONG until answered and return its MAV_RESULT, or raise LinkError."""
         values = " ".join(f"{value:g}" for value in params)
         what = f"{name_of(MavCommand, number)} {values}".strip()
         self.transcript.add("sent", f"COMMAND_LONG {what}{note and f': {note}'}")
@@ -155,11 +149,7 @@ class Vehicle:
         return self.command(MavCommand.DO_SET_MODE, flags, *mode, note=note)
 
     def fly(self, setpoint: Setpoint) -> float:
-        """Give MAVSDK a setpoint, which it sends at once and then repeats at 20 Hz.
-
-        Returns:
-            When it reached the vehicle, by its clock [s].
-        """
+        """Send a setpoint, repeated by MAVSDK at 20 Hz; return its arrival [s, vehicle time]."""
         reached: list[float] = []
 
         def send() -> None:
@@ -195,10 +185,7 @@ class Vehicle:
             raise LinkError(f"nothing heard for {SILENT_S:g} s")
 
     def wait_for(self, condition: Callable[[], Any], timeout_s: float) -> Any:
-        """Wait for a condition, by the vehicle's clock, and return its last value.
-
-        Raises LinkError if the vehicle is silent, or its clock stands still.
-        """
+        """Wait by the vehicle's clock for a condition and return its value; LinkError if silent."""
         start_s, wall = self.telemetry.boot_s, WallClock()
         while not (value := condition()):
             elapsed_s = self.telemetry.boot_s - start_s

@@ -106,10 +106,9 @@ class VehicleClock:
         return self._telemetry.boot_s if found is None else found.boot_s
 
     def sending_time(self) -> float:
-        """Return when a message that is sent right after this call reaches the vehicle [s].
+        """Return the arrival time of a message sent right after this call [s].
 
-        It is asked before sending and not after: a call into MAVSDK sends at once, but returns only
-        when Python's other threads let it.
+        Read before sending: a MAVSDK call sends at once but returns later.
         """
         newest_s, found = self._telemetry.boot_s, self.exchange()
         if found is None:

@@ -61,16 +61,7 @@ class BareLoop:
 
 
 def measure(request: ProfileRequest, policy: PolicyUnderTest, bar: Bar) -> Recording:
-    """Time the decisions.
-
-    Args:
-        request: What was asked for.
-        policy: What decides.
-        bar: Counts the decisions, warm-up included.
-
-    Raises:
-        UsageError: The network cannot be run.
-    """
+    """Time the policy's decisions, counted by `bar` with warm-up; UsageError if it cannot run."""
     loop = BareLoop(request, policy)
     stamps = []
     used_us = processor_time_us()

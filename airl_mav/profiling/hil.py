@@ -75,10 +75,9 @@ def measure(request: ProfileRequest, policy: PolicyUnderTest, bar: Bar) -> Recor
     """Fly until there are enough decisions; arguments as `bare.measure`.
 
     Raises:
-        UsageError: It cannot be flown as asked.
-        ProfilingError: No flight controller is heard, or the flight ended before there were enough
-            decisions.
-        KeyboardInterrupt: Ctrl-C or SIGTERM; the vehicle has been asked to land.
+        UsageError: The request cannot be flown.
+        ProfilingError: No heartbeat, or the flight ended before there were enough decisions.
+        KeyboardInterrupt: Ctrl-C or SIGTERM; the vehicle was commanded to land.
     """
     load_us, first_us, _ = cold_start(request, policy)
     interrupted, stop = threading.Event(), threading.Event()
@@ -165,13 +164,13 @@ def _fly(
 
 
 def relate_stamps(mission: TimedMission, warm_up: int) -> tuple[Stamps, str, tuple[str, ...]]:
-    """Convert the exposure of the frames to this computer's clock, if the two can be related.
+    """Convert the frames' exposure to this computer's clock, if the clocks can be related.
 
     Returns:
-        Columns of the decisions after the warm-up, and `exchange_*` ones, one row an exchange in
-        flight; the stamp from which the age of a command counts; remarks. `capture_simulator_us` is
-        the exposure by the simulator's clock, `capture_us` by this computer's, within
-        `capture_uncertainty_us`.
+        Columns after the warm-up, with `exchange_*` columns of one row per exchange in flight; the
+            stamp from which command age counts; remarks. `capture_us` is the exposure by this
+            computer's clock, within `capture_uncertainty_us`, `capture_simulator_us` by the
+            simulator's.
     """
     columns = mission.result.log.columns()
     stamps = {name: np.asarray(columns[name][warm_up:], np.int64) for name in STAMPS}

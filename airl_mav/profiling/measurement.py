@@ -70,10 +70,7 @@ class Recording:
 
     @cached_property
     def stages(self) -> dict[str, Samples]:
-        """Durations [µs] of each stage, all flights together, by the stage's key.
-
-        At level hil also `ROUND_TRIP`, and `T1_UNCERTAINTY` if the clocks could be related.
-        """
+        """Durations [µs] by stage of all flights; hil adds `ROUND_TRIP` and `T1_UNCERTAINTY`."""
         stages = pool(stage_samples(flight) for flight in self.flights)
         columns = self.columns
         if "exchange_sent_us" in columns:
@@ -97,11 +94,7 @@ class Recording:
         return np.repeat(np.arange(len(rows), dtype=np.int64), rows)
 
     def command_ages(self, hold_s: float) -> CommandAges:
-        """Return how old the flown command was.
-
-        Args:
-            hold_s: t3 [s] with which the commands would be flown, if they were not.
-        """
+        """Return the age of the flown command, with a hold of `hold_s` [s] if not flown."""
         if self.exposure is None:
             return ages_in_closed_loop(self.stages["t2"], round(hold_s * US_PER_S))
         columns = self.columns
@@ -167,14 +160,7 @@ class ComputerMeasurement:
 
 
 def save(measured: ComputerMeasurement, path: Path) -> tuple[Path, ...]:
-    """Write samples, stamps, facts, and last of all the profile that names them.
-
-    Returns:
-        The files: the profile at `path`, and beside it samples, stamps and facts.
-
-    Raises:
-        UsageError: The folder cannot be written to.
-    """
+    """Write samples, stamps, facts and finally the profile at `path`; return all four paths."""
     recording, profile = measured.recording, measured.profile
     stem = f"{measured.computer}.{measured.workload}"
     samples, arrays, facts = (path.with_name(stem + end) for end in (".txt", ".npz", ".json"))
@@ -197,13 +183,7 @@ def save(measured: ComputerMeasurement, path: Path) -> tuple[Path, ...]:
 
 
 def share(measured: ComputerMeasurement, path: Path) -> Path:
-    """Write one file that another machine flies as: the computer, this workload, its samples.
-
-    With how it was measured: the machine's state, the soak, versions, and a digest of the samples.
-
-    Raises:
-        UsageError: The file cannot be written.
-    """
+    """Write computer, workload, samples and provenance as one file that other machines can fly."""
     workload = measured.profile.workloads[measured.workload]
     samples_ms = tuple(round(each, 3) for each in workload.latency.samples_ms or ())
     machine, soaked = measured.machine, measured.soak

@@ -49,10 +49,10 @@ class PolicyUnderTest:
 
 @contextmanager
 def open_policy(request: ProfileRequest) -> Iterator[PolicyUnderTest]:
-    """Give the policy under test; the files of a random network last as long as the context.
+    """Open the policy under test; a random network's files last as long as the context.
 
     Raises:
-        UsageError: There is no such policy or vehicle, no camera fits, or the network is too large.
+        UsageError: No such policy or vehicle, no fitting camera, or the network is too large.
             `FieldError`s name the field.
     """
     if request.policy is not None and request.network is not None:
@@ -106,12 +106,7 @@ def _write_random_network(
     vehicles: dict[str, VehicleProfile],
     folder: Path,
 ) -> str:
-    """Write a random network and its card; return the first vehicle whose camera fits it.
-
-    Raises:
-        UsageError: The size of the image is out of range, no vehicle's camera fits it, or the
-            network is too large.
-    """
+    """Write a random network and its card; return the first vehicle whose camera fits it."""
     if request.runtime != "onnx":
         raise FieldError("runtime", request.runtime, "onnx with a random network")
     paper = request.image == PAPER_IMAGE

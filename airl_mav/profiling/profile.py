@@ -62,24 +62,23 @@ def profile(
     progress: Progress | None = None,
     root: Path = Path("/"),
 ) -> ComputerMeasurement:
-    """Measure how long this computer takes for a policy's decisions.
+    """Measure the latency of a policy's decisions on this computer.
 
     Args:
-        request: What is measured, and how.
-        out: Folder of computer profiles to which this one and its samples are written, at the very
-            end; a profile that it holds keeps its other workloads. None: nothing is written.
-        progress: Who looks on.
-        root: Where /sys is found, for the power.
+        request: Subject and method of the measurement.
+        out: Folder of computer profiles, written at the end; other workloads are kept. None = no
+            files.
+        progress: Progress display.
+        root: Root of /sys, for the power.
 
     Returns:
-        The measurement; its `profile` can be flown as, by `Scenario.computer`, once it is written.
+        The measurement; its written `profile` is accepted by `Scenario.computer`.
 
     Raises:
-        UsageError: The input cannot be used; nothing was measured. `FieldError`s name the field.
-        ProfilingError: The measurement broke off: a process or the link was lost. Nothing was
-            written.
-        ImportError: Level sitl or a random network without the extra that it needs.
-        KeyboardInterrupt: Ctrl-C; nothing was written, and a vehicle in flight is being landed.
+        UsageError: Invalid input; nothing was measured. `FieldError`s name the field.
+        ProfilingError: A process or the link was lost. Nothing was written.
+        ImportError: Level sitl or a random network needs an extra.
+        KeyboardInterrupt: Ctrl-C; nothing was written, and a vehicle in flight lands.
     """
     progress = progress or Progress()
     machine = describe_machine()
@@ -216,10 +215,9 @@ def _computer(
     date: str,
     power: DrawnPower,
 ) -> ComputerProfile:
-    """Return the computer as its file has it, with the watts and the price of the request.
+    """Return the computer as its file has it, with the request's watts and price.
 
-    Watts that nobody gave are those that were measured, but at level sitl, where the simulator
-    draws them too.
+    Otherwise the watts are measured, except at level sitl, where the simulator draws power too.
     """
     given = {"watts": request.watts, "price_usd": request.price_usd}
     changes: dict[str, Any] = {name: value for name, value in given.items() if value is not None}

@@ -59,7 +59,7 @@ def measure(request: ProfileRequest, policy: PolicyUnderTest, bar: Bar) -> Recor
     """Fly until there are enough decisions; arguments as `bare.measure`.
 
     Raises:
-        UsageError: It cannot be flown as asked.
+        UsageError: The request cannot be flown.
         ProfilingError: A process was lost too often, or the flights are too short.
     """
     # Before the network is opened for anything else.

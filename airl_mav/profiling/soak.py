@@ -133,16 +133,16 @@ def soak(
     stop: Callable[[], bool] = lambda: False,
     progress: Callable[[float], None] = lambda _: None,
 ) -> Soak:
-    """Go on deciding, and look at the machine every second.
+    """Repeat decisions and read the machine's state every second.
 
     Args:
-        decide: Makes a decision; returns when it began and when it ended by the clock [µs].
-        duration_s: How long, > 0 [s].
-        clock: Tells the time.
-        read: Looks at the machine; not while a decision is timed.
+        decide: Makes a decision; returns its start and end by the clock [µs].
+        duration_s: Duration, > 0 [s].
+        clock: The clock.
+        read: Reads the machine, never while a decision is timed.
         state: Returns the state of the machine, before and after.
-        stop: Returns whether to end early. The first row is always finished.
-        progress: Told the seconds that have passed, each row.
+        stop: Returns whether to end early, after the first row.
+        progress: Called with the elapsed seconds, each row.
     """
     before, begun_us = state(), clock.time_us()
     end_us = begun_us + round(duration_s * US_PER_S)

@@ -34,19 +34,7 @@ def write_soak_page(
     facts: Sequence[tuple[str, str]],
     machine: Mapping[str, Any],
 ) -> Path:
-    """Write the page, its Markdown and its picture; return the page.
-
-    Args:
-        soaked: What happened.
-        folder: Where to.
-        name: Name of the files, without suffix.
-        title: One line for people.
-        facts: What decided on what.
-        machine: As of `describe_machine`.
-
-    Raises:
-        UsageError: The folder cannot be written.
-    """
+    """Write the page of a soak with its Markdown and picture into a folder; return the page."""
     rows = tuple(
         (part, *duration_cells(summarize(samples)))
         for part, samples in (("first", soaked.first_us), ("last", soaked.last_us))

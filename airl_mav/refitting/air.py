@@ -109,12 +109,7 @@ class Air:
         return None if north is None or east is None else (north, east)
 
     def along_thrust(self, velocity: Array, quaternion: Array) -> Array:
-        """Return the drag per mass along the body's down axis (n,) [m/s²].
-
-        Args:
-            velocity: (n, 3) NED [m/s].
-            quaternion: (n, 4) body to world.
-        """
+        """Return drag per mass along body down (n,) [m/s²], of NED velocities and attitudes."""
         north, east = self.wind or (0.0, 0.0)
         against = velocity - np.array([north, east, 0.0])
         linear = self.drag_1_s.value or 0.0
@@ -144,13 +139,7 @@ class _Rows:
 
 
 def fit_air(flown: Flown, vehicle: VehicleProfile, rng: np.random.Generator) -> Air:
-    """Fit drag and wind.
-
-    Args:
-        flown: The flight.
-        vehicle: As it was thought to be: its accelerometer, its quadratic drag.
-        rng: Draws from the posterior distribution.
-    """
+    """Fit drag and wind; the profile gives accelerometer and quadratic drag."""
     mass_kg = vehicle.body.mass_kg
     quadratic_1_m = vehicle.drag.quadratic_n_s2_m2 / mass_kg
     known = vehicle.drag.linear_n_s_m / mass_kg
@@ -215,10 +204,10 @@ def _estimate(
 
 
 def _felt_rows(flown: Flown, bias_m_s2: float) -> _Rows | None:
-    """Return the equations of the accelerometer across the body's axis, where a log has it.
+    """Return the equations of the accelerometer across the body's axis, if logged.
 
-    It is the sensor as it measured, less what the estimator has learnt of its bias in the end: what
-    is corrected in flight changes as it learns.
+    The sensor's raw data are corrected by the estimator's final bias, since its bias in flight
+    changes as it learns.
     """
     log = flown.log
     if log is None:
@@ -253,11 +242,10 @@ def _learnt_bias(log: VehicleLog, start_us: float, end_us: float) -> Array | Non
 
 
 def _lean_rows(flown: Flown, bias_m_s2: float) -> _Rows | None:
-    """Return the equations of telemetry: velocity gained in a window, against lean and drag.
+    """Return the equations of telemetry: velocity gained in a window against lean and drag.
 
-    Attitude and velocity of an estimator are not of quite the same moment. In a flight that goes
-    to and fro, a lean that is early by d looks like a drag of d w², w the angular frequency; so d
-    is estimated, too.
+    An estimator's attitude and velocity differ slightly in time. In oscillating flight, a lean that
+    is early by d looks like a drag of d w², w the angular frequency, so d is estimated too.
     """
     path = flown.path.between(*flown.airborne_us)
     if len(path) < LEAST_ROWS:
@@ -293,11 +281,7 @@ def _lean_rows(flown: Flown, bias_m_s2: float) -> _Rows | None:
 
 
 def _posterior(rows: _Rows, quadratic_1_m: float) -> tuple[Array, Array]:
-    """Return mean and covariance of the parameters, given all equations.
-
-    Neighbouring rows depend on each other: n of them count as n over their integrated
-    autocorrelation time.
-    """
+    """Return mean and covariance of the parameters; rows count by their autocorrelation time."""
     held = np.concatenate([[np.inf] * _AIR, rows.prior])
     matrix = rows.matrix.reshape(-1, len(held))
     middle: Array = np.zeros(len(held))

@@ -47,10 +47,7 @@ def vehicle_toml(
 def computer_profile(
     box: BlackBox, board: ComputerProfile, samples: int, source: str
 ) -> ComputerProfile | None:
-    """Return the computer that flew, with the latency of its policy as a workload.
-
-    None where the policy has no network, or is not here, so that its size is not known.
-    """
+    """Return the computer with its policy's latency as a workload; None without the network."""
     config = box.run.get("config", {})
     network = _network(str(config.get("policy")), str(config.get("runtime", "onnx")), box)
     if network is None:
@@ -107,12 +104,12 @@ def write_refit(
     """Write the files of a refit into a folder, `refit.json` last.
 
     Args:
-        out: New or empty.
-        data: Of `refit.json`.
+        out: New or empty folder.
+        data: Content of `refit.json`.
         vehicle: The vehicle's profile as TOML.
-        computer: The computer's; None: none can be written.
-        samples_ms: t2 of the decisions; none: no latency is written.
-        remarks: Where all this comes from.
+        computer: The computer; None = not written.
+        samples_ms: t2 of the decisions; empty = not written.
+        remarks: Sources of the data.
 
     Raises:
         OSError: They cannot be written.

@@ -69,11 +69,7 @@ class Flown:
 
 
 def flown_of(box: BlackBox, log: VehicleLog | None) -> Flown:
-    """Return a flight that a companion recorded, with the vehicle's log of it.
-
-    Raises:
-        UsageError: It holds no navigation, or the log is of another flight.
-    """
+    """Return a recorded flight with its vehicle's log; UsageError without navigation."""
     decisions = box.all_of(Decision)
     path = path_of(box)
     begun = [each.time_us for each in box.all_of(Phase) if each.phase == NAVIGATING]
@@ -107,10 +103,7 @@ def flown_of(box: BlackBox, log: VehicleLog | None) -> Flown:
 
 
 def flown_by_log(log: VehicleLog) -> Flown:
-    """Return a flight that only the vehicle's log tells: its longest stretch off the ground.
-
-    Raises UsageError: it never left the ground, or is not that of a quadrotor.
-    """
+    """Return the longest airborne stretch of a quadrotor's log; UsageError without one."""
     rotors = log.parameters.get("CA_ROTOR_COUNT", MOTORS)
     if rotors != MOTORS:
         raise UsageError(f"{log.path}: CA_ROTOR_COUNT {rotors:g}: accepted: {MOTORS}, a quadrotor")
@@ -149,10 +142,10 @@ def _logged_path(log: VehicleLog) -> Trajectory:
 def _velocity_setpoints(
     log: VehicleLog, start_us: int, end_us: int
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the longest row of setpoints by which velocity alone steered, as in `Flown`.
+    """Return the longest sequence of setpoints that command velocity alone, as in `Flown`.
 
-    That is in Offboard, with neither a position nor an acceleration beside it: what a mode plans
-    smoothly, and feeds forward, does not show how long the vehicle takes to answer.
+    Smooth plans with feed-forward do not show the vehicle's response time, so position and
+    acceleration setpoints are left out.
     """
     tracked = log.setpoint.between(start_us, end_us)
     steered = np.isfinite(tracked.values[:, :3]).all(axis=1)
@@ -179,9 +172,9 @@ def seconds(times_us: NDArray[np.int64], from_us: int) -> NDArray[np.float64]:
 
 
 def _airborne_us(path: Trajectory, navigation_us: int, ended_us: int) -> tuple[int, int]:
-    """Return from when to when, around the navigation, the vehicle was clear of the ground [µs].
+    """Return the airborne interval around the navigation [µs].
 
-    The ground is where the recording began, where that was before take-off; else only the
+    Ground level is the start of the recording if that was before take-off; otherwise only the
     navigation counts.
     """
     high = path.position[:, 2] < path.position[0, 2] - AIRBORNE_M

@@ -47,13 +47,7 @@ def no_latencies() -> Latencies:
 def fit_latencies(
     stamps: Mapping[str, NDArray[np.int64]], clocks: Alignment | None, rng: np.random.Generator
 ) -> Latencies:
-    """Return the latencies of a flight's decisions.
-
-    Args:
-        stamps: Of the decisions, by column.
-        clocks: How the companion's clock and the log's relate; None without a log.
-        rng: Draws the resamples of the intervals.
-    """
+    """Return the latencies of a flight's decisions; `clocks` is None without a log."""
     t2_us = stamps["action_ready_us"] - stamps["infer_start_us"]
     stamped = stamps["capture_us"] != NO_STAMP
     t1_us = (stamps["decoded_us"] - stamps["capture_us"])[stamped]

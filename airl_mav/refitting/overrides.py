@@ -41,15 +41,15 @@ def overrides_of(
     air: Air,
     logged: Mapping[str, float],
 ) -> tuple[Override, ...]:
-    """Return what a flight says otherwise than a profile.
+    """Return the parameters in which a flight differs from its profile.
 
     Args:
-        profile: As it was thought to be.
-        flying: The same with the computer that flew along, which is no part of the profile.
-        response: How it answered.
-        thrust: What the rotors carried.
-        air: What the air did.
-        logged: Parameters of the flight controller, as its log has them.
+        profile: The profile.
+        flying: The profile with the computer that flew along.
+        response: Fitted response.
+        thrust: Fitted thrust.
+        air: Fitted drag and wind.
+        logged: Parameters of the flight controller from its log.
     """
     found: list[Override] = []
     carried_kg = flying.body.mass_kg - profile.body.mass_kg
@@ -90,10 +90,7 @@ def refitted(profile: VehicleProfile, overrides: Sequence[Override]) -> VehicleP
 
 
 def _parameters(profile: VehicleProfile, logged: Mapping[str, float]) -> list[Override]:
-    """Return the gains and limits that the flight controller had, where the profile has others.
-
-    Values out of PX4's ranges, which it stores all the same, are left out: no profile has such.
-    """
+    """Return the flight controller's gains and limits that differ, except out-of-range values."""
     held = parameter_values(profile.parameters)
     remark = "as the flight controller's log has it"
     return [

@@ -63,20 +63,17 @@ def unobserved(
 def block_intervals(
     jacobian: Array, residuals: Array, times_s: Array, rng: np.random.Generator
 ) -> Array:
-    """Return how far the ends of the 95 % intervals are from a least-squares solution, (2, k).
+    """Return the offsets of 95 % intervals from a least-squares solution, lower and upper (2, k).
 
-    Residuals of a flight depend on their neighbours, so seconds of them are resampled, not single
-    ones; each resample moves the solution by one Gauss-Newton step (the one-step bootstrap). The
-    interval is wider by Student's t, as the blocks are few.
+    Neighbouring residuals are correlated, so blocks of seconds are resampled; each resample moves
+    the solution by one Gauss-Newton step (one-step bootstrap). Student's t accounts for the few
+    blocks. Unobservable parameters have infinite intervals.
 
     Args:
         jacobian: (n, k) of the residuals.
         residuals: (n,) at the solution.
         times_s: (n,) of the residuals [s].
-        rng: Draws the resamples.
-
-    Returns:
-        Lower and upper end, relative to the solution; infinite where nothing holds the parameter.
+        rng: Generator of the resamples.
     """
     block = np.unique(np.floor((times_s - times_s.min()) / BLOCK_S), return_inverse=True)[1]
     count = int(block.max()) + 1

@@ -115,23 +115,21 @@ def refit(
     out: Path | None = None,
     seed: int = 1,
 ) -> Refit:
-    """Fit what a flight says of its vehicle, its computer and the wind.
+    """Fit vehicle, computer and wind to a flight.
 
     Args:
-        path: The black box; or a vehicle's log (.ulg) alone, of whatever flew it: that tells
-            nothing of the computer.
-        ulg: The vehicle's own log of the flight of a black box; without it mass, thrust and link
-            stay unknown.
-        vehicle: Profile to refit: a shipped name, or a path; None: the one that the black box
-            names, `quad` for a log alone.
-        known: What the profile is right about: a flight tells only the greatest thrust per mass.
+        path: Black box, or a vehicle's log (.ulg) alone, which contains nothing about the computer.
+        ulg: The vehicle's log of the black box's flight; without it mass, thrust and link stay
+            unknown.
+        vehicle: Profile to refit: name or path; None = that of the black box, or `quad`.
+        known: Quantity to take from the profile: a flight shows only thrust per mass.
         out: New folder for `vehicle.toml`, `computer.toml`, `latency.txt`, `scenario.toml` and
-            `refit.json`; None: nothing is written.
-        seed: Draws the resamples of the intervals.
+            `refit.json`; None = no files.
+        seed: Seed of the intervals' resamples.
 
     Raises:
-        UsageError: A file cannot be read, or holds no navigation, or the log is of another flight,
-            or alone and of none. `FieldError`s name the field.
+        UsageError: A file cannot be read, has no navigation, or is the log of another flight.
+            `FieldError`s name the field.
     """
     check_out(out)
     box: BlackBox | None = None

@@ -52,10 +52,7 @@ class ResponseFit:
     yaw_rate_time_s: FittedQuantity
 
     def response(self, drag_1_s: float, known: Response | None) -> Response | None:
-        """Return the table for a profile; what was not observed is as it was known before.
-
-        None where that was not known either.
-        """
+        """Return the table for a profile, unobserved values from `known`; None if unknown."""
         found = {
             "dead_time_s": self.dead_time_s.value,
             "velocity_time_s": self.velocity_time_s.value,
@@ -101,15 +98,10 @@ class _Solution:
 
 
 def fit_response(flown: Flown, known: Response | None, rng: np.random.Generator) -> ResponseFit:
-    """Fit the response of a flight's vehicle.
+    """Fit the response of a flight's vehicle; `known` is the profile's.
 
     With the vehicle's log the dead time counts from when the flight controller took the setpoint;
-    without, from when it was sent, and the link is a part of it.
-
-    Args:
-        flown: The flight.
-        known: What the profile says.
-        rng: Draws the resamples of the intervals.
+    otherwise it includes the link.
     """
     velocity, turn = _describe(known)
     if (why := _too_little(flown)) is not None:
@@ -148,11 +140,7 @@ def _too_little(flown: Flown) -> str | None:
 
 
 def _changes(flown: Flown) -> Array:
-    """Return by how much the setpoints change, (n, 4).
-
-    A companion's from one decision to the next; a log has the same setpoint many times, so from
-    their mean.
-    """
+    """Return the steps of the setpoints (n, 4): against the previous decision, or a log's mean."""
     if flown.is_logged_only:
         return np.asarray(flown.setpoints - flown.setpoints.mean(axis=0))
     return np.diff(flown.setpoints, axis=0)
@@ -192,8 +180,8 @@ def _velocity(
 ) -> tuple[FittedQuantity, FittedQuantity]:
     """Fit dead time and time constant to the velocities north and east together.
 
-    Where the setpoints are those of the companion, a third parameter is the time at which the
-    heading turned them: that of their arrival, which is before the answer. A log has them turned.
+    A companion's setpoints are in the heading frame, so the heading's time is a third parameter:
+    their arrival, before the response. Logged setpoints are already in the world frame.
     """
     grid = driven.grid_s
 
@@ -223,10 +211,7 @@ def _velocity(
 
 
 def _link_share(flown: Flown) -> tuple[float, float, str]:
-    """Return what of the time from sending to being told is not the vehicle's [s].
-
-    With how unsure that is (95 %), and where it comes from.
-    """
+    """Return the round trip's part outside the vehicle [s], 95 % interval and source."""
     if flown.is_logged_only:
         # A change is first seen in the sample after it: half their distance later, on the mean.
         step_s = float(np.median(np.diff(flown.sent_us))) / US_PER_S
@@ -292,10 +277,7 @@ def _best(
     high: tuple[float, float, float],
     free: int = 3,
 ) -> _Solution:
-    """Return the best least-squares solution of several starts; times are above zero.
-
-    Parameters from number `free` on have no lower bound either.
-    """
+    """Return the best of several least-squares starts; the first `free` parameters are positive."""
     low = [0.0, 0.01, 0.0]
     low[free:] = [-math.inf] * (3 - free)
     found = [

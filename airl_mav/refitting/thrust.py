@@ -47,14 +47,14 @@ class Thrust:
 def fit_thrust(
     flown: Flown, vehicle: VehicleProfile, air: Air, known: Known, rng: np.random.Generator
 ) -> Thrust:
-    """Fit the greatest thrust per mass, and from it the one that the profile does not know.
+    """Fit maximum thrust per mass, and from it whichever of mass and thrust is unknown.
 
     Args:
-        flown: The flight; without the vehicle's log nothing tells what the motors did.
-        vehicle: As it was thought to be, with all that it carries.
-        air: What the air did.
-        known: Which of mass and thrust is taken from the profile.
-        rng: Draws the resamples of the interval.
+        flown: The flight; without the vehicle's log the motor commands are unknown.
+        vehicle: The profile with its payload.
+        air: Fitted drag and wind.
+        known: Quantity to take from the profile.
+        rng: Generator of the interval's resamples.
     """
     ratio = vehicle.thrust_n / vehicle.body.mass_kg
     blank = unobserved("thrust_per_mass_m_s2", "thrust per mass", "m/s²", "", ratio)
@@ -62,13 +62,7 @@ def fit_thrust(
 
 
 def thrust_of(found: FittedQuantity, vehicle: VehicleProfile, known: Known) -> Thrust:
-    """Return what the greatest thrust per mass says of a vehicle.
-
-    Args:
-        found: Thrust per mass [m/s²].
-        vehicle: As it was thought to be, with all that it carries.
-        known: Which of mass and thrust is taken from the profile.
-    """
+    """Return mass and thrust of a vehicle from its maximum thrust per mass [m/s²]."""
     ratio = vehicle.thrust_n / vehicle.body.mass_kg
     values = found.value, found.low, found.high
     if found.value is None:
@@ -147,10 +141,10 @@ def _ratio(
 
 
 def _shares(commands: Array, log: VehicleLog, vehicle: VehicleProfile) -> Array:
-    """Return the thrusts (n, 4), as shares of the greatest, of motor commands (n, 4).
+    """Return motor commands (n, 4) as shares of maximum thrust.
 
-    PX4's actuator_motors are thrusts already where THR_MDL_FAC tells it the motors' curve; its
-    outputs alone are bent (src/lib/mixer_module/functions/FunctionMotors.hpp).
+    PX4's actuator_motors are thrusts where THR_MDL_FAC describes the motors' curve; only its
+    outputs are bent (src/lib/mixer_module/functions/FunctionMotors.hpp).
     """
     curve = 0.0 if log.parameters.get("THR_MDL_FAC") else vehicle.rotor.thrust_curve
     u = np.clip(commands, 0.0, 1.0)

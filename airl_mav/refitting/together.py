@@ -38,15 +38,14 @@ def refit_together(
     out: Path | None = None,
     seed: int = 1,
 ) -> Refit:
-    """Fit what the logs of several flights say of the vehicle that all of them flew.
+    """Fit the vehicle that flew several logged flights.
 
     Args:
-        logs: The vehicle's logs (.ulg), two or more, the newest last: of that one gains are taken.
-        vehicle: Profile to refit: a shipped name, or a path; None: `quad`.
-        known: What the profile is right about: a flight tells only the greatest thrust per mass.
-        out: New folder for `vehicle.toml`, `scenario.toml` and `refit.json`; None: nothing is
-            written.
-        seed: Draws the resamples of the intervals.
+        logs: Two or more logs (.ulg), the newest last; gains are taken from it.
+        vehicle: Profile to refit: name or path; None = `quad`.
+        known: Quantity to take from the profile: a flight shows only thrust per mass.
+        out: New folder for `vehicle.toml`, `scenario.toml` and `refit.json`; None = no files.
+        seed: Seed of the intervals' resamples.
 
     Raises:
         UsageError: A file cannot be read, or is the log of no flight. `FieldError`s name the field.

@@ -57,10 +57,7 @@ def estimation_table(flights: Sequence[TrackedFlight]) -> TableView | None:
 
 
 def run_ages(run: LoadedRun) -> CommandAges:
-    """Return how old the commands of a run were while they were flown.
-
-    From the frame that a command rests on to the motors, and on until the next command's motors.
-    """
+    """Return the ages of a run's commands, from frame until the next command moves the motors."""
     seen: list[NDArray[np.int64]] = [np.zeros(0, np.int64)]
     flown, flight = list(seen), list(seen)
     for number, stamps in sorted(run.latency.items()):
@@ -82,10 +79,7 @@ def _acted(stamps: Mapping[str, NDArray[Any]]) -> tuple[NDArray[np.int64], NDArr
 
 
 def ages_table(ages: CommandAges, end_to_end: Summary) -> TableView | None:
-    """Return the age of the flown command beside the latency that it begins with.
-
-    None where no command was followed by another.
-    """
+    """Return the age of the flown command beside its latency; None without consecutive commands."""
     n = ages.youngest_us.size
     if not n or not ages.time_us:
         return None

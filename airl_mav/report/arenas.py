@@ -15,11 +15,7 @@ from airl_mav.rehearsal.run_folder import LoadedRun, RunInfo
 
 
 def vehicle_of(info: RunInfo) -> VehicleProfile:
-    """Return the vehicle of a run, with what it carried and the camera of its environment.
-
-    Raises:
-        UsageError: Its profile cannot be found any more.
-    """
+    """Return the vehicle of a run as loaded; raise UsageError where its profile is missing."""
     vehicle = load_profile("vehicles", info.setup.vehicle.name, VehicleProfile)
     change = info.config.get("environment", {}).get("camera", {})
     given = {name: value for name, value in change.items() if value is not None}
@@ -29,9 +25,9 @@ def vehicle_of(info: RunInfo) -> VehicleProfile:
 
 
 def check_trust(arena: str, spec: ArenaSpec) -> None:
-    """Raise UsageError for an arena whose generator is code that nobody has asked this process for.
+    """Raise UsageError for an arena whose generator is custom code that this process did not load.
 
-    A run folder that comes from elsewhere must not choose what runs here.
+    A run folder from elsewhere must not choose the code that runs here.
     """
     if spec.generator != OBSTACLES and not is_loaded(GENERATORS, spec.generator):
         raise UsageError(
@@ -41,11 +37,7 @@ def check_trust(arena: str, spec: ArenaSpec) -> None:
 
 
 def spec_of(arena: str) -> ArenaSpec:
-    """Return the profile of an arena that can be made here.
-
-    Raises:
-        UsageError: It cannot be found any more, or its generator is code that nobody asked for.
-    """
+    """Return an arena's profile; raise UsageError if it is missing or its generator untrusted."""
     spec = load_profile("arenas", arena, ArenaSpec)
     check_trust(arena, spec)
     return spec

@@ -46,10 +46,7 @@ ROOM = {
 
 
 def coloured_segmentation(seen: NDArray[np.int32]) -> NDArray[np.uint8]:
-    """Return what is seen (h, w), `Picture.seen`, in colour, RGB (h, w, 3).
-
-    Obstacles have the colours of matplotlib's tab20 without its greys, over and over.
-    """
+    """Return `Picture.seen` (h, w) as RGB (h, w, 3), obstacles in tab20 without its greys."""
     tab20 = colormaps["tab20"](np.arange(20), bytes=True)[:, :3]
     own = np.delete(tab20, (14, 15), axis=0)
     most = max(int(seen.max(initial=0)) + 1, OBSTACLE)
@@ -95,17 +92,17 @@ def still(
     rays: int,
     range_m: float,
 ) -> Pixels:
-    """Return a picture by the ray caster.
+    """Return a ray-cast picture from a camera position NED [m] and attitude [w, x, y, z].
 
     Args:
-        arena: What is seen.
+        arena: The arena.
         centers: (n, 3) present obstacle centres NED [m].
         camera: Its intrinsics.
         position: (3,) camera NED [m].
         quaternion: (4,) unit [w, x, y, z] camera -> NED.
-        show: What to draw; of flow, which needs the motion, `report.ground_truth` makes pictures.
-        rays: Of a pixel of rgb and grey, each way.
-        range_m: Depth that is darkest [m].
+        show: Content, except flow (see `report.ground_truth`).
+        rays: Rays per pixel and axis, for rgb and grey.
+        range_m: Depth drawn darkest [m].
     """
     if show in ("rgb", "grey"):
         rgb = antialiased(arena, centers, camera, position, quaternion, rays)
@@ -117,12 +114,7 @@ def still(
 
 
 def moments(flight: ReplayedFlight, rate_hz: float) -> range:
-    """Return when a film of a flight has pictures [µs]: from the start of navigation to the end.
-
-    Args:
-        flight: The flight.
-        rate_hz: Pictures a second, as `period_ms` rounds them.
-    """
+    """Return the picture times [µs] of a film, from the start of navigation to the end."""
     path, record = flight.path, flight.record
     begin = record.started_us if record.navigation_us is None else record.navigation_us
     begin, end = max(begin, int(path.time_us[0])), int(path.time_us[-1])
@@ -132,17 +124,7 @@ def moments(flight: ReplayedFlight, rate_hz: float) -> range:
 def film(
     flight: ReplayedFlight, camera: Intrinsics, drawn: Drawn, moments: Iterable[int]
 ) -> Iterator[Pixels]:
-    """Yield what the camera of a recorded flight saw.
-
-    Args:
-        flight: The flight.
-        camera: Intrinsics; it sits and looks as that of the vehicle.
-        drawn: What draws.
-        moments: When [µs].
-
-    Raises:
-        UsageError: The arena of the flight cannot be made any more.
-    """
+    """Yield pictures of a camera mounted as the vehicle's; UsageError if the arena is missing."""
     if flight.arena is None:
         raise UsageError(f"flight {flight.label}: its arena cannot be made any more")
     mount = PolicyCamera.of(flight.vehicle.camera).mount
@@ -166,15 +148,12 @@ def write_png(path: Path, pixels: Pixels) -> None:
 
 
 def write_film(path: Path, pictures: Iterator[Pixels], rate_hz: float) -> int:
-    """Write pictures as an animated GIF or WebP, or as a video, by the suffix.
-
-    Returns:
-        Their number.
+    """Write an animated GIF or WebP, or a video, by the suffix; return the number of pictures.
 
     Raises:
-        UsageError: A video whose width or height is odd.
-        OSError: It cannot be written.
-        ImportError: A video, and PyAV is not installed: the extra `film`.
+        UsageError: A video has an odd width or height.
+        OSError: The file cannot be written.
+        ImportError: Videos need PyAV: the extra `film`.
     """
     if path.suffix.lower() == VIDEO:
         written, count = _video(pictures, period_ms(rate_hz))

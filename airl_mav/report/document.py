@@ -166,14 +166,7 @@ def provenance_facts(
 
 
 def write_document(document: Document, folder: Path) -> Path:
-    """Write the page, the Markdown and the PNG files, each whole or not at all.
-
-    Returns:
-        The path of the page.
-
-    Raises:
-        UsageError: The folder cannot be written.
-    """
+    """Write page, Markdown and PNG files, each atomically; return the page's path."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         drawn = []

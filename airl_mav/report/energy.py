@@ -61,12 +61,7 @@ class FlightEnergy:
 
 
 def flight_energies(run: LoadedRun, vehicle: VehicleProfile | None) -> list[FlightEnergy]:
-    """Return the energies, where they are known, of all flights that navigated, as they were flown.
-
-    Args:
-        run: The run.
-        vehicle: What flew, as loaded; None leaves the airframe's energy whole.
-    """
+    """Return the known energies of all flights that navigated; without `vehicle`, undivided."""
     watts = run.info.setup.computer_watts
     flights = []
     for e in run.episodes:
@@ -85,10 +80,7 @@ def flight_energies(run: LoadedRun, vehicle: VehicleProfile | None) -> list[Flig
 
 
 def energy_table(flights: Sequence[FlightEnergy], *, on_ground: bool = False) -> TableView:
-    """Return the energy of all flights (at least one) together, by part.
-
-    A computer `on_ground` takes nothing from the pack, and has no row.
-    """
+    """Return the energy of all flights together, by part; a computer `on_ground` has no row."""
     columns = (
         Column("part", number=False),
         Column("all flights", "kJ"),

@@ -51,15 +51,7 @@ def flight_data(
     range_m: float,
     again: PolicyAgain | None,
 ) -> dict[str, Any]:
-    """Return one flight as plain data.
-
-    Args:
-        flight: Its motion.
-        stamps: Its columns in `latency.npz`.
-        seen: Its decisions, worked out again; empty where that cannot be done.
-        range_m: Farthest depth that the camera returns [m].
-        again: Its policy; None: no scores are known.
-    """
+    """Return one flight as plain data, with depth up to `range_m` and the policy's scores."""
     count = len(flight.time_s)
     keep = np.unique(np.linspace(0, count - 1, min(count, TIME_POINTS)).round().astype(int))
     commands = flight.commands

@@ -65,12 +65,7 @@ class _Extent:
 
 
 def flight_pictures(prefix: str, panels: Sequence[Panel]) -> list[theme.Picture]:
-    """Draw every panel by itself; their axes are the same.
-
-    Args:
-        prefix: What the pictures' names begin with; their number follows.
-        panels: One or more, each with one flight or more.
-    """
+    """Draw each panel by itself, with common axes; names are the prefix and a number."""
     extent = _extent(panels)
     return [
         _draw_panel(
@@ -85,12 +80,7 @@ def flight_pictures(prefix: str, panels: Sequence[Panel]) -> list[theme.Picture]
 
 
 def overview_picture(run: LoadedRun, arenas: Mapping[int, Arena]) -> theme.Picture:
-    """Draw all flights of a run, coloured by how they ended.
-
-    Args:
-        run: The run, with one episode or more.
-        arenas: Arenas by episode index, of some episodes at least one: for the walls.
-    """
+    """Draw all flights of a run coloured by outcome; `arenas` (by episode index) give the walls."""
     bounds = {arena.bounds for arena in arenas.values()}
     arena = next(iter(arenas.values())) if len(bounds) == 1 else None
     panel = Panel("", "", run.episodes, run.trajectories, arena)
@@ -120,10 +110,7 @@ def _extent(panels: Sequence[Panel]) -> _Extent:
 def _draw_panel(
     name: str, alt: str, panel: Panel, extent: _Extent, *, width_in: float
 ) -> theme.Picture:
-    """Draw one panel.
-
-    Every seed has its own obstacles, so they are drawn only where all flights have one seed.
-    """
+    """Draw one panel, with obstacles only where all its flights share a seed."""
     figure = theme.new_figure(width_in, 1.05 + 0.9 * width_in * extent.tall)
     ax: Axes = figure.subplots()
     seeds = {flight.arena_seed for flight in panel.episodes}

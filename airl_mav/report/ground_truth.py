@@ -36,23 +36,13 @@ class TakingCamera:
     """Takes pictures, one ray a pixel, with the table `imaging` where the camera has one."""
 
     def __init__(self, camera: Camera, name: str = "") -> None:
-        """Take the camera of a vehicle profile; it sits on the vehicle as it does there.
-
-        `name` is that of a further camera.
-        """
+        """Prepare a profile's camera at its mount; `name` is that of an additional camera."""
         self._camera, self._intrinsics = camera, Intrinsics.of(camera)
         self._forming = None if camera.imaging is None else ImageFormation(camera, name)
         self._mount = Mount.of(camera)
 
     def __call__(self, arena: Arena, elapsed_us: int, motion: Motion, seed: int) -> Pixels:
-        """Return a picture (h, w, 3), or (h, w) of grey; depth in colours.
-
-        Args:
-            arena: What is seen.
-            elapsed_us: Time since the episode's start [µs].
-            motion: How the vehicle moves.
-            seed: Of what the sensor draws.
-        """
+        """Return a picture (h, w, 3), grey (h, w) or coloured depth, at a time of the episode."""
         image: NDArray[Any]
         if self._forming is not None:
             frame = elapsed_us // self._camera.period_us
@@ -143,9 +133,7 @@ def truth_of(
 def truth_film(
     show: Shown, flight: ReplayedFlight, camera: Intrinsics, moments: Iterable[int]
 ) -> Iterator[NDArray[Any]]:
-    """Yield what each pixel shows along the way of a recorded flight; see `truth_of`.
-
-    The camera sits and looks as that of the vehicle.
+    """Yield `truth_of` along a recorded flight, for a camera mounted as the vehicle's.
 
     Raises:
         UsageError: The arena of the flight cannot be made any more.
@@ -161,9 +149,9 @@ def truth_film(
 
 
 def coloured_flow(flow: NDArray[np.float32]) -> Pixels:
-    """Return flow (h, w, 2) as a picture: its direction is the hue, its speed the saturation.
+    """Return flow (h, w, 2) as a picture: hue = direction, saturation = speed.
 
-    Red moves to the right, then clockwise; what moves as fast as the fastest hundredth is full.
+    Red moves right, then clockwise; saturation is full at the 99th percentile.
     """
     across, down = np.nan_to_num(flow[..., 0]), np.nan_to_num(flow[..., 1])
     speed = np.hypot(across, down)

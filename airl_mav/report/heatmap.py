@@ -77,13 +77,7 @@ def colours() -> Colormap:
 
 
 def heat_picture(name: str, alt: str, heat: HeatMap) -> theme.Picture:
-    """Draw a heat map by itself.
-
-    Args:
-        name: File name without suffix.
-        alt: What it shows.
-        heat: What to draw.
-    """
+    """Draw a heat map by itself."""
     figure = theme.new_figure(*heat.size_in)
     draw_heat_map(figure, heat)
     return theme.render(figure, name, alt)

@@ -29,10 +29,7 @@ from airl_mav.report.verdict import OverallVerdict, load_verdict
 
 
 def run_html(run: LoadedRun) -> str:
-    """Return a run as a piece of HTML; nothing is written.
-
-    Arenas that cannot be made any more are left out of the picture.
-    """
+    """Return a run as HTML, without arenas that cannot be made any more."""
     verdict = verdict_of(run)
     table = _figures(run_headlines(run, summarize_run(run)))
     picture = _picture(run) if run.episodes else None
@@ -42,14 +39,7 @@ def run_html(run: LoadedRun) -> str:
 def comparison_html(
     comparison: Comparison, loaded: Mapping[str, LoadedRun], folder: Path, page: Path
 ) -> str:
-    """Return a comparison as a piece of HTML; nothing is written.
-
-    Args:
-        comparison: What is shown.
-        loaded: Its runs by name.
-        folder: Where it lies.
-        page: Its report.
-    """
+    """Return a comparison in a folder as HTML that links to its page."""
     verdict = load_verdict(folder)
     document = comparison_to_document(comparison, loaded, folder, verdict)
     table = runs_table(comparison.runs, measures=MEASURES)

@@ -84,10 +84,10 @@ class PolicyAgain:
 
 
 def policy_again(info: RunInfo) -> PolicyAgain | None:
-    """Return the policy that flew a run, if it is one of discrete actions that lies here unchanged.
+    """Return the policy of a run if it has discrete actions and its file is here unchanged.
 
-    Nothing of the run folder is run: a policy that is code, or whose card names code, is passed
-    over, as is one whose file has changed since.
+    Code from the run folder is never executed: policies that are code, or whose card names code,
+    are skipped.
     """
     name, digest = info.config.get("policy"), info.config.get("policy_sha256")
     if not isinstance(name, str) or digest is None or names_code(name):
@@ -113,15 +113,7 @@ def seen_decisions(
     vehicle: VehicleProfile,
     again: PolicyAgain | None = None,
 ) -> Iterator[SeenDecision]:
-    """Yield the decisions of a flight in the order flown, as far as they were recorded.
-
-    Args:
-        run: The run.
-        record: The flight.
-        arena: Where it flew.
-        vehicle: What flew, with the camera of its environment.
-        again: Its policy; None: no scores.
-    """
+    """Yield the recorded decisions of a flight in order; scores need the policy in `again`."""
     path, stamps = run.trajectories.get(record.index), run.latency.get(record.index, {})
     column = setpoint_column(stamps) or SETPOINT
     needed = ("capture_us", "infer_start_us", "action_ready_us", "sent_us", column)

@@ -78,15 +78,12 @@ def info_of(box: BlackBox, digest: str = "") -> RunInfo:
 def episode_of(
     box: BlackBox, path: Trajectory | None = None, remarks: tuple[str, ...] = ()
 ) -> FlownEpisode:
-    """Return the flight.
+    """Return the flight of a black box; UsageError without its settings.
 
     Args:
         box: The recording.
-        path: Its path, where it is known better; None: the one that the flight controller told.
-        remarks: Notes of the flight, in front of those of the recording.
-
-    Raises:
-        UsageError: The black box does not hold its settings.
+        path: A more accurate path; None = the flight controller's telemetry.
+        remarks: Notes that precede those of the recording.
     """
     asked = settings_of(box)
     path = path_of(box) if path is None else path
@@ -136,10 +133,7 @@ def episode_of(
 
 
 def path_of(box: BlackBox) -> Trajectory:
-    """Return the path as the flight controller told it, where it told one.
-
-    With the power that the pack gave; 0 W where none is told.
-    """
+    """Return the path and power [W] of the telemetry; 0 W where power is unknown."""
     told = box.all_of(Telemetry)
     rows = [(*each.position, *each.velocity, *each.quaternion) for each in told]
     states = np.array(rows, np.float64).reshape(len(rows), 10)  # None becomes NaN
@@ -154,11 +148,7 @@ def path_of(box: BlackBox) -> Trajectory:
 
 
 def stamps_of(box: BlackBox) -> dict[str, NDArray[Any]]:
-    """Return the stamps of the decisions by column, as `latency.stamps.DecisionLog.columns`.
-
-    Raises:
-        UsageError: The black box does not hold its settings.
-    """
+    """Return the decisions' columns as `latency.stamps.DecisionLog.columns`."""
     decisions, commands = box.all_of(Decision), settings_of(box).pilot.commands
     columns: dict[str, NDArray[Any]] = {
         name: np.array([getattr(each, name) for each in decisions], np.int64) for name in STAMPS
@@ -171,9 +161,9 @@ def stamps_of(box: BlackBox) -> dict[str, NDArray[Any]]:
 
 
 def _power_w(statuses: list[Status], times_us: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the power (n,) at times (n,): the newest that was told, the first one before it.
+    """Return the newest known power (n,) at times (n,); NaN if never measured.
 
-    NaN where none was measured. Older recordings hold PX4's -1 A where it measures no current.
+    Older recordings hold PX4's -1 A where current is not measured.
     """
     told = [
         (status.time_us, status.voltage_v * status.current_a)
@@ -210,9 +200,9 @@ def _cut(box: BlackBox, ended_us: int) -> tuple[str, tuple[str, ...]]:
 def _arrived_us(
     path: Trajectory, navigation_us: int | None, ended_us: int, asked: FlownSettings
 ) -> int | None:
-    """Return when the goal was reached [µs], as the referee of a rehearsal sees it; None: never.
+    """Return the arrival time at the goal [µs] by the referee's rule; None = never.
 
-    That is before the companion notices, which looks once a decision.
+    The companion checks once per decision and therefore notices later.
     """
     if navigation_us is None:
         return None

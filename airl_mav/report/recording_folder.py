@@ -28,10 +28,10 @@ from airl_mav.vehicle_log.ulog import VehicleLog
 
 
 def logged_episode_of(box: BlackBox, log: VehicleLog) -> FlownEpisode:
-    """Return the flight, with the path, the power and the motor outputs of the vehicle's log.
+    """Return the flight with path, power and motor outputs of the vehicle's log.
 
     Raises:
-        UsageError: The black box does not hold its settings, or the log is of another flight.
+        UsageError: The black box has no settings, or the log is of another flight.
     """
     told = path_of(box)
     stamps = stamps_of(box)
@@ -55,10 +55,7 @@ def logged_episode_of(box: BlackBox, log: VehicleLog) -> FlownEpisode:
 
 
 def offset_us(clocks: Alignment) -> float:
-    """Return what is added to the log's times to have the companion's [µs].
-
-    Half of the round trip is the way up, where both ways are known together.
-    """
+    """Return the offset from log to companion time [µs], half the round trip if known."""
     if clocks.accepted_us is None:
         return clocks.told_us
     return 0.5 * (clocks.told_us - clocks.accepted_us)
@@ -99,15 +96,15 @@ WITH_LOG = "-with-log"
 
 
 def take_in(path: Path, ulg: Path | None = None) -> Path:
-    """Make the run folder of a black box, beside it, and return it; it may be there already.
+    """Return the run folder of a black box, created beside it if missing.
 
     Args:
         path: The black box.
-        ulg: The vehicle's own log of the flight; None: what the companion recorded is all.
+        ulg: The vehicle's own log; None = companion data only.
 
     Raises:
         UsageError: The file is no black box, the log is of another flight, or the folder holds
-            something else.
+            other files.
     """
     box = read_black_box(path)
     folder = path.with_suffix("") if ulg is None else path.with_name(f"{path.stem}{WITH_LOG}")

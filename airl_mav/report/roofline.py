@@ -28,12 +28,7 @@ RATES = 200
 
 
 def roofline_document(found: Roofline, made: Mapping[str, Any]) -> Document:
-    """Return everything that a roofline says.
-
-    Args:
-        found: The roofline; it has a point.
-        made: As `core.provenance.provenance` gives it.
-    """
+    """Return the document of a roofline with at least one point, and its provenance."""
     return Document(
         name="roofline",
         title=f"Roofline of {found.vehicle}",

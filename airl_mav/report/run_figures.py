@@ -56,10 +56,7 @@ def speed_colours() -> Colormap:
 
 
 def latency_figure(stage: Stage, samples: Samples, summary: Summary) -> theme.Picture:
-    """Draw how one stage's durations (n,) [µs] spread: histogram above, cumulated share below.
-
-    Its percentiles are marked on the lower axes.
-    """
+    """Draw a stage's durations [µs]: histogram above, cumulative share with percentiles below."""
     margins = theme.Margins(left=0.58, right=0.14, bottom=0.42, top=0.27, between=0.1)
     figure, (top, bottom) = theme.stacked_axes(2, 4.2, 2.6, margins, height_ratios=(1.1, 1.0))
     values = np.sort(samples) / US_PER_MS
@@ -108,10 +105,7 @@ def long_tail(values: NDArray[np.float64]) -> bool:
 
 
 def _bin_edges(values: NDArray[np.float64]) -> list[float]:
-    """Return the histogram's edges for sorted values (n,): about two times the root of n bins.
-
-    Their number is odd, so that a single duration lies in the middle of its bar.
-    """
+    """Return histogram edges of sorted values: about 2 sqrt(n) bins, an odd number."""
     bins = int(np.clip(2.0 * math.sqrt(len(values)), 12, 40)) | 1
     low, high = float(values[0]), float(values[-1])
     if long_tail(values):
@@ -124,13 +118,13 @@ def _bin_edges(values: NDArray[np.float64]) -> list[float]:
 def map_figure(
     episode: EpisodeRecord, trajectory: Trajectory | None, arena: Arena | None, top_speed: float
 ) -> theme.Picture:
-    """Draw a flight from above over its arena, as the arena was when the flight ended.
+    """Draw a flight from above over its arena, as it was at the flight's end.
 
     Args:
         episode: The flight.
-        trajectory: Its path; None draws the arena alone.
-        arena: Where it flew; None draws path and goal alone.
-        top_speed: Upper end of the colour scale [m/s], the same for all flights of a run.
+        trajectory: Its path; None = arena alone.
+        arena: Its arena; None = path and goal alone.
+        top_speed: Upper end of the colour scale [m/s].
     """
     tall = 1.0
     if arena is not None:
@@ -220,15 +214,10 @@ def speed_bar(bar: Colorbar) -> None:
 def coloured_pieces(
     points: NDArray[np.float64], values: NDArray[np.float64], top: float
 ) -> tuple[list[NDArray[np.float64]], NDArray[np.float64]]:
-    """Cut a line where its colour changes.
-
-    Args:
-        points: (n, 2) its corners, n >= 2.
-        values: (n - 1,) value of each segment.
-        top: Value at the upper end of the colour scale, which begins at 0.
+    """Split a line (n, 2) where the colour of its segments' values (n - 1,) changes.
 
     Returns:
-        The pieces, each (k, 2), which share their ends; and the value of each.
+        Connected pieces, each (k, 2), and their values.
     """
     step = top / PATH_COLOURS
     levels = np.clip((values / step).astype(int), 0, PATH_COLOURS - 1)

@@ -78,17 +78,14 @@ def build_page(
     vehicle: VehicleProfile | None = None,
     verdict: OverallVerdict | None = None,
 ) -> Path:
-    """Write `report.html` and the PNG files, each one whole or not at all.
+    """Write `report.html` and its PNG files, each atomically; return the page's path.
 
     Args:
-        run: The run, as `run_folder.load` returns it.
-        arenas: The arena of each episode, by episode index; a flight without one is drawn without.
-        out: Folder to write into; None is the run's own.
-        vehicle: What flew; without it the energy has fewer parts, and the causes say less.
-        verdict: Heads the page.
-
-    Returns:
-        The path of the page.
+        run: The run.
+        arenas: Arenas by episode index; others are drawn without.
+        out: Output folder; None = the run's.
+        vehicle: The vehicle; None = less detail in energy and causes.
+        verdict: The verdict shown first.
     """
     folder = out or run.path
     folder.mkdir(parents=True, exist_ok=True)

@@ -44,10 +44,10 @@ MAX_LISTED = 25
 
 
 def verdict_of(run: LoadedRun, requirements: Sequence[Requirement] | None = None) -> OverallVerdict:
-    """Return the verdict of a run. `requirements` that are None are those of its `verdict.json`.
+    """Return a run's verdict; `requirements` None = those of its `verdict.json`.
 
     Raises:
-        FieldError: A requirement asks for a gap: a single run has no reference.
+        FieldError: A gap is required: a single run has no reference.
     """
     if requirements is None:
         requirements = requirements_of(run.path)
@@ -59,19 +59,15 @@ def verdict_of(run: LoadedRun, requirements: Sequence[Requirement] | None = None
 def write_report(
     run: LoadedRun | Path, out: Path | None = None, verdict: OverallVerdict | None = None
 ) -> Path:
-    """Write a run's `report.html`, `verdict.json` and the PNG files. Nothing is printed.
+    """Write a run's `report.html`, `verdict.json` and PNG files; return the page's path.
 
     Args:
         run: The run, or its folder.
-        out: Folder to write into; None: the run's own.
-        verdict: Heads the page; None: as of `verdict_of`.
-
-    Returns:
-        The path of the page.
+        out: Output folder; None = the run's.
+        verdict: The verdict shown first; None = `verdict_of`.
 
     Raises:
-        UsageError: The folder holds no run, a file of it is damaged, or a profile of it cannot be
-            found or used any more.
+        UsageError: The folder holds no run, a file is damaged, or a profile is missing or unusable.
     """
     if isinstance(run, Path):
         run = load(run)
@@ -89,14 +85,7 @@ def print_report(
     page: Path | None = None,
     verdict: OverallVerdict | None = None,
 ) -> None:
-    """Print the verdict, what was flown, the tables, and where the page lies.
-
-    Args:
-        run: The run.
-        console: Where to.
-        page: Path of the HTML page, if there is one.
-        verdict: None: as of `verdict_of`.
-    """
+    """Print the verdict (None = `verdict_of`), settings, tables and the page's path."""
     print_verdict((verdict or verdict_of(run)).lines, console)
     console.print()
     summary, feeds = summarize_run(run), not run.info.setup.computer_on_ground
@@ -124,20 +113,7 @@ def print_report(
 def show_report(
     run: LoadedRun, verdict: OverallVerdict, console: Console, progress: Progress | None = None
 ) -> Path | None:
-    """Write the report of a run, where a flight was finished, and print it.
-
-    Args:
-        run: The run.
-        verdict: Heads it.
-        console: Where it is printed.
-        progress: Is told that it is drawn.
-
-    Returns:
-        The path of the page; None: no flight was finished.
-
-    Raises:
-        UsageError: See `write_report`.
-    """
+    """Write and print the report of a run with finished flights; return the page's path or None."""
     progress = progress or Progress()
     progress.status(DRAWING)
     page = write_report(run, verdict=verdict) if run.episodes else None

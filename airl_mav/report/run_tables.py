@@ -167,10 +167,7 @@ def _kilojoules(joules: float | None) -> str:
 
 
 def quality_table(summary: RunSummary, *, computer: bool = True) -> TableView:
-    """Return the quality of flight over all episodes, with intervals.
-
-    Without `computer` its energy has no row: it is on the ground.
-    """
+    """Return the flight quality with intervals; `computer` = its energy is the vehicle's."""
     columns = (
         Column("measure", number=False),
         Column("value"),
@@ -216,10 +213,7 @@ def _estimate_row(measure: Measure, mean: Estimate, median: Estimate) -> tuple[s
 
 
 def real_time_table(run: LoadedRun, summary: RunSummary) -> TableView:
-    """Return how the run kept pace with the wall clock, and what the companion took.
-
-    A recorded flight kept pace by itself.
-    """
+    """Return real-time pace and the companion's resource use."""
     columns = (Column("measure", number=False), Column("value"), Column("n"))
     nothing: NDArray[np.int64] = np.zeros(0, np.int64)
     lateness = [stamps.get(TICK_LATENESS, nothing) for stamps in run.latency.values()]

@@ -80,12 +80,12 @@ def scene_json(
     everyone: Sequence[EpisodeRecord],
     fov_deg: float,
 ) -> str:
-    """Return all views as JSON that may stand inside a script element.
+    """Return all views as JSON for a script element.
 
     Args:
         run: The run, for the paths of `everyone`.
-        flights: Those that can be looked at one by one, in the order of the list.
-        everyone: Those that are shown together, in the last view; none with fewer than two.
+        flights: Flights with a view each, in the order of the list.
+        everyone: Flights of the last, common view; omitted below two.
         fov_deg: Horizontal field of view of the camera [deg]; 0 draws none.
     """
     top = top_speed(flights)
@@ -110,13 +110,7 @@ def plotly_script() -> str:
 
 
 def flight_view(flight: SceneFlight, top: float, fov_deg: float) -> dict[str, Any]:
-    """Return the view of one flight: a figure, and what its time slider moves.
-
-    Args:
-        flight: What to show.
-        top: Upper end of the colour scale [m/s].
-        fov_deg: Horizontal field of view of the camera [deg].
-    """
+    """Return one flight's figure and slider data; `top` [m/s] is the upper end of the colours."""
     record, arena = flight.record, flight.arena
     path = _thinned(flight.path, POINTS)
     place, speed = _east_north_up(path.position), path.speed()
@@ -199,10 +193,7 @@ def flight_view(flight: SceneFlight, top: float, fov_deg: float) -> dict[str, An
 
 
 def _view(fov_deg: float) -> list[float]:
-    """Return how long the edges of the field of view are [m], and how far from ahead [rad].
-
-    Where all is seen there are none; a line ahead shows the heading.
-    """
+    """Return length [m] and half angle [rad] of the field of view; a line if all round."""
     if fov_deg >= ALL_ROUND_DEG:
         return [VIEW_M, 0.0]
     return [VIEW_M if fov_deg else 0.0, round(math.radians(fov_deg) / 2.0, 3)]
@@ -211,14 +202,7 @@ def _view(fov_deg: float) -> list[float]:
 def all_flights_view(
     run: LoadedRun, everyone: Sequence[EpisodeRecord], arena: Arena | None, *, shared: bool
 ) -> dict[str, Any]:
-    """Return the view of many flights together, coloured by how they ended.
-
-    Args:
-        run: The run, for the paths.
-        everyone: The flights.
-        arena: One of their arenas, for the walls.
-        shared: Whether all flights have that arena, and so its obstacles.
-    """
+    """Return the common view, coloured by outcome; obstacles only if the arena is `shared`."""
     traces = [] if arena is None else _arena_traces(arena, obstacles=shared)
     for outcome in OUTCOME_COLOURS:
         records = [record for record in everyone if record.outcome is outcome]
@@ -242,15 +226,10 @@ def all_flights_view(
 
 
 def body_mesh(obstacles: Obstacles, i: int, center: Floats) -> tuple[Floats, NDArray[np.int64]]:
-    """Return an obstacle as a closed mesh.
-
-    Args:
-        obstacles: All of them.
-        i: Which one.
-        center: (3,) where it is, NED [m].
+    """Return obstacle i at a centre NED [m] as a closed mesh.
 
     Returns:
-        Corners (n, 3), east, north, up [m], and the corners of the triangles (m, 3).
+        Corners (n, 3), east, north, up [m], and triangles (m, 3).
     """
     half, yaw = obstacles.half_size[i], float(obstacles.yaw[i])
     if obstacles.shape[i] == Shape.BOX:

@@ -129,16 +129,9 @@ def _blank(width_in: float, height_in: float, layout: Literal["constrained"] | N
 def stacked_axes(
     rows: int, width_in: float, height_in: float, margins: Margins, **options: Any
 ) -> tuple[Figure, NDArray[np.object_]]:
-    """Return a figure with axes (rows,) one below the other, which share their x axis.
+    """Return a figure with axes (rows,) that share x, of a size [inch]; `options` go to `subplots`.
 
-    The margins are given, not worked out from all texts: that would cost as much as drawing.
-
-    Args:
-        rows: Number of axes, >= 1.
-        width_in: Width of the figure [inch].
-        height_in: Height of the figure [inch].
-        margins: Room around and between the axes.
-        options: More for `Figure.subplots`.
+    Fixed margins: computing them from the texts would cost as much as drawing.
     """
     figure = _blank(width_in, height_in, None)
     axes = figure.subplots(rows, 1, sharex=True, squeeze=False, **options)[:, 0]
@@ -160,10 +153,7 @@ def stacked_axes(
 
 
 def share_grid(axes: Sequence[Axes]) -> None:
-    """Draw the lowest axes' vertical grid through all stacked axes, whose limits are final.
-
-    In place of ticks that the others would make for their own, of which only the grid is seen.
-    """
+    """Draw one vertical grid through all stacked axes, cheaper than ticks of their own."""
     lowest = axes[-1]
     low, high = lowest.get_xlim()
     ticks = [float(tick) for tick in lowest.get_xticks() if low <= tick <= high]

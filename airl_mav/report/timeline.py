@@ -97,12 +97,7 @@ def timeline_of(run: LoadedRun) -> Timeline:
 
 
 def timeline_figure(timeline: Timeline, stages: Sequence[Stage]) -> theme.Picture:
-    """Draw each stage (at least one) of all decisions, in the order flown.
-
-    Args:
-        timeline: The decisions.
-        stages: Those that have durations.
-    """
+    """Draw each stage (at least one) of all decisions, in the order flown."""
     margins = theme.Margins(left=0.62, right=0.12, bottom=0.42, top=0.22, between=0.26)
     figure, rows = theme.stacked_axes(len(stages), 10.6, 0.62 + 1.0 * len(stages), margins)
     band = _draw_bands(rows, timeline)
@@ -216,15 +211,7 @@ def _outlier_text(limit: Fence) -> str:
 
 
 def sawtooth_notes(timeline: Timeline, vehicle: VehicleProfile | None) -> list[str]:
-    """Explain the saw in the age of the newest frame, where it is seen.
-
-    Decisions that follow each other at one interval meet the camera's frames, which have another,
-    a little later or earlier each time.
-
-    Args:
-        timeline: The decisions.
-        vehicle: For its camera; None: nothing is explained.
-    """
+    """Explain a sawtooth in frame age: the intervals of decisions and camera frames beat."""
     periods = timeline.stages["period"]
     periods = periods[periods != NO_STAMP]
     if vehicle is None or len(periods) < SAW_DECISIONS:
@@ -254,15 +241,7 @@ def sawtooth_notes(timeline: Timeline, vehicle: VehicleProfile | None) -> list[s
 def slowest_table(
     timeline: Timeline, stages: Sequence[Stage]
 ) -> tuple[TableView, list[tuple[int, float]]] | None:
-    """Return the decisions that stand out from frame to motors; None when none does.
-
-    Beside the table comes the place of each row: the flight, and seconds since the start of
-    navigation.
-
-    Args:
-        timeline: The decisions.
-        stages: Those that the run has.
-    """
+    """Return the outlying decisions from frame to motors, with flight and navigation time [s]."""
     whole = timeline.stages["end_to_end"]
     there = np.flatnonzero(whole != NO_STAMP)
     limit = fence(whole[there])

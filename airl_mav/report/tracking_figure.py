@@ -66,13 +66,7 @@ class _Line:
 def tracking_figure(
     flight: TrackedFlight, seen: Sequence[SeenDecision] = (), range_m: float = 0.0
 ) -> theme.Picture:
-    """Draw a flight over time, zero where navigation begins.
-
-    Args:
-        flight: What is drawn.
-        seen: Decisions whose images stand above the rows, `IMAGES` of them at most.
-        range_m: Farthest depth that the camera returns [m].
-    """
+    """Draw a flight over navigation time, with up to `IMAGES` images of decisions above."""
     rows = _rows(flight)
     strip = STRIP_IN if seen else 0.0
     height = 0.45 + 0.3 + strip + len(rows) * ROW_IN
@@ -180,10 +174,7 @@ def _mean_power(time_s: Floats, power_w: Floats, keep: NDArray[np.int64]) -> Flo
 
 
 def _draw_image(figure: Figure, place: int, image: NDArray[np.uint8], title: str) -> None:
-    """Draw an image (rows, columns, 3) above the rows, at a place from the left, under its title.
-
-    It has no axes: those would cost more than all else of it.
-    """
+    """Draw an image (rows, columns, 3) with a title above the rows, without costly axes."""
     width, height = (float(inches) for inches in figure.get_size_inches())
     room = (WIDTH_IN - LEFT_IN - RIGHT_IN) / IMAGES
     centre = LEFT_IN + (place + 0.5) * room

@@ -112,15 +112,15 @@ def judge_run(
     """Return the verdict of a run.
 
     Args:
-        setup: What was flown on what.
-        quality: Its figures.
-        episodes: Its flights.
-        requirements: What is asked of it.
-        against: The run against a reference on the same seeds; None: there is none.
-        reference: What the reference is called.
+        setup: Policy, vehicle and computer.
+        quality: Aggregated figures.
+        episodes: The flights.
+        requirements: Requirements to check.
+        against: Comparison with a reference on the same seeds; None = none.
+        reference: Name of the reference.
 
     Raises:
-        FieldError: A requirement asks for a gap, and there is no reference.
+        FieldError: A gap is required without a reference.
     """
     computer = Path(setup.computer.name).stem
     rate = quality.success_rate
@@ -214,13 +214,7 @@ def requirements_of(folder: Path) -> tuple[Requirement, ...]:
 
 
 def write_junit(verdict: OverallVerdict, path: Path, suite: str) -> None:
-    """Write a verdict as JUnit XML: the validity of the flights and each requirement is a case.
-
-    Args:
-        verdict: The verdict.
-        path: Where to.
-        suite: Name of the suite: the command.
-    """
+    """Write a verdict as JUnit XML: flight validity and each requirement are a case of `suite`."""
     cases = len(verdict.findings) + 1
     failures = sum(finding.decision is not Decision.MET for finding in verdict.findings)
     counts = {

@@ -49,23 +49,23 @@ def run_sweep(
     computer: Computer | None = None,
     stop: Stop = never,
 ) -> tuple[Sweep, str | None]:
-    """Carry out the trials that are left; `sweep.json` is written as each one ends.
+    """Run the remaining trials; `sweep.json` is written after each.
 
     Args:
-        path: The sweep's folder, new or to be gone on with; all workers see it under this path.
-        config: What is searched.
-        executor: Who trains.
+        path: The sweep's folder, new or to resume; all workers see it under this path.
+        config: The search space.
+        executor: Executor of the trainings.
         command: The command line, for the records.
-        progress: Where to say how far it is.
-        device: What trains: cpu or cuda.
-        computer: For which each network's decision latency is estimated; None: for none.
-        stop: Asked several times a second; True ends it all, with what has ended kept.
+        progress: Progress display.
+        device: cpu or cuda.
+        computer: Computer for latency estimates; None = none.
+        stop: Polled several times a second; True stops the sweep and keeps finished trials.
 
     Returns:
-        The sweep as far as it is, and why it was broken off, if it was.
+        The sweep so far, and the reason of an early end or None.
 
     Raises:
-        UsageError: The input cannot be used, or the folder holds something else.
+        UsageError: Invalid input, or the folder holds something else.
     """
     say = partial(progress.note, style="yellow")
     with open_campaign(path, declaration(config), command=command, say=say) as store:

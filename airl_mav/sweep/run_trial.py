@@ -20,13 +20,7 @@ from airl_mav.training.store import TrainingFolder, TrainingProgress
 
 
 def run_trial(folder: SweepFolder, trial: Trial, command: str, device: str) -> TrialResult:
-    """Carry out a trial from wherever it is, or return what it came to.
-
-    Args:
-        folder: The sweep's.
-        trial: Which one.
-        command: The command line, for the policy's card.
-        device: What trains: cpu or cuda.
+    """Run or resume a trial on cpu or cuda, and return its result, kept in the folder.
 
     Raises:
         UsageError: It cannot be trained, or another process is at it.

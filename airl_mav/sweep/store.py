@@ -66,11 +66,7 @@ class SweepFolder:
         return self.config.evaluation.model_dump(mode="json")
 
     def result(self, trial: Trial) -> TrialResult | None:
-        """Return what a trial came to; None while it has not ended.
-
-        Raises:
-            UsageError: The file is not what was written, or of another trial or other flights.
-        """
+        """Return a trial's result, None before its end; UsageError if it is of another trial."""
         path = self.trial_path(trial) / RESULT_FILE
         if not path.exists():
             return None

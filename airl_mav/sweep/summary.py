@@ -90,10 +90,7 @@ class Sweep:
         return tuple(cell for cell in self.cells if cell.arena == arena)
 
     def best(self, arena: str) -> NetworkSummary | None:
-        """Return the cell with the greatest mean success; of equals the one with fewer MACs.
-
-        None while no trial has ended.
-        """
+        """Return the cell with the highest mean success, then the fewest MACs; None if empty."""
         known = [cell for cell in self.of(arena) if cell.results]
         return max(known, key=lambda cell: (_rate(cell), -cell.macs), default=None)
 
@@ -131,9 +128,8 @@ def _rate(cell: NetworkSummary) -> float:
 def over_seeds(results: Sequence[TrialResult]) -> Estimate:
     """Return the mean success rate over training seeds with a 95 % interval.
 
-    The interval holds two: Student's t over the seeds, which knows how much trainings differ, and
-    Wilson's over all flights, which has a width even where they do not differ. With one seed only
-    the latter, which then says nothing of other trainings.
+    The interval covers Student's t over the seeds, for differences between trainings, and Wilson's
+    over all flights, which has a width even without such differences. One seed has only the latter.
     """
     rates = np.array([result.success_rate for result in results])
     if not rates.size:
@@ -149,12 +145,7 @@ def over_seeds(results: Sequence[TrialResult]) -> Estimate:
 
 
 def summarize(folder: SweepFolder, made: dict[str, Any], computer: Computer | None = None) -> Sweep:
-    """Return all cells from the results that are there.
-
-    Raises:
-        UsageError: A result is damaged or of something else; the computer has nothing to estimate
-            a latency from.
-    """
+    """Return all cells from the existing results; UsageError if one is damaged or foreign."""
     by_cell: dict[tuple[str, int, int], list[Trial]] = {}
     for trial in trials(folder.config):
         by_cell.setdefault((trial.arena, trial.layers, trial.filters), []).append(trial)
@@ -193,9 +184,7 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 
 def estimated_ms(computer: ComputerProfile, macs: int) -> float:
-    """Return the mean decision latency t2 of a network on a computer, estimated from its MACs [ms].
-
-    The rule of `--workload estimate`: in proportion to the workload nearest in MACs.
+    """Return a network's mean t2 [ms], scaled by MACs from the computer's nearest workload.
 
     Raises:
         UsageError: The computer has no workload.

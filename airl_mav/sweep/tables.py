@@ -96,11 +96,7 @@ def networks_table(sweep: Sweep, arena: str) -> TableView:
 def print_plan(
     name: str, config: SweepConfig, computer: Computer | None, path: Path, console: Console
 ) -> None:
-    """Print what a sweep would do; nothing is written.
-
-    Raises:
-        UsageError: The folder holds results of something else.
-    """
+    """Print a sweep's plan; UsageError if the folder holds other results."""
     sweep = summarize(SweepFolder(path, config), {}, computer)
     steps, episodes = config.training.steps, config.evaluation.episodes
     most = "at most " if config.training.selection.stop_at is not None else ""

@@ -51,10 +51,7 @@ class Trial:
 
 
 def trials(config: SweepConfig) -> list[Trial]:
-    """Return all trials: the first seed of all cells, then the second, and so on.
-
-    So that a sweep that is looked at early has something to show in every cell.
-    """
+    """Return all trials by seed, then cell, so that early results cover every cell."""
     return [
         Trial(grid.arena, layers, filters, seed)
         for seed in config.seeds

@@ -72,10 +72,7 @@ class Alignment:
 
     @property
     def round_trip_us(self) -> float | None:
-        """From sending a setpoint to being told what it could have changed [µs].
-
-        Both ways on the link and the age of the telemetry, without the vehicle's own time.
-        """
+        """Time from sending a setpoint to its telemetry [µs], without the vehicle's response."""
         return None if self.accepted_us is None else self.told_us + self.accepted_us
 
 
@@ -86,14 +83,14 @@ def align(
     setpoints: NDArray[np.float64],
     commands: CommandKind = "velocity",
 ) -> Alignment:
-    """Return how the clocks of a recorded flight and of its vehicle's log relate.
+    """Return the relation of the clocks of a recorded flight and of its vehicle's log.
 
     Args:
-        path: What telemetry told, by the companion's clock.
-        log: The flight controller's.
-        sent_us: (k,) when the companion sent setpoints [µs].
+        path: Telemetry, by the companion's clock.
+        log: The flight controller's log.
+        sent_us: (k,) times at which the companion sent setpoints [µs].
         setpoints: (k, 4) forward, right, down [m/s], yaw rate [rad/s]; or as `commands` has them.
-        commands: What the setpoints command.
+        commands: Kind of the setpoints.
 
     Raises:
         UsageError: The log is of another flight, or nothing moved.
@@ -139,10 +136,7 @@ def _coarse(path: Trajectory, log: VehicleLog) -> float:
 
 
 def _refined(path: Trajectory, log: VehicleLog, coarse_us: float) -> float:
-    """Return the shift [µs] at which attitude and velocity agree best, near a coarse one.
-
-    Each difference counts by how much the quantity changes in the flight.
-    """
+    """Return the shift [µs] near a coarse one at which attitude and velocity agree best."""
 
     def cost(shift_us: float) -> float:
         inside = _inside(path, log, shift_us)
@@ -158,11 +152,7 @@ def _refined(path: Trajectory, log: VehicleLog, coarse_us: float) -> float:
 
 
 def _down_and_nose(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return where the body's down axis points, level, and its nose: (n, 4), without signs' jumps.
-
-    Interpolated quaternions may jump between q and -q; these products of two do not, where the
-    samples are dense against the turn.
-    """
+    """Return the body's down axis, level, and its nose (n, 4), continuous across q and -q."""
     w, x, y, z = (quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True)).T
     return np.stack(
         [
@@ -243,13 +233,13 @@ def _bounds(
     seen: Series,
     near: NDArray[np.float64],
 ) -> list[tuple[float, float]]:
-    """Return between which times after the expected one each setpoint appears in the log [µs].
+    """Return the interval after the expected time [µs] in which each setpoint appears in the log.
 
     Args:
-        expected_us: (k,) when each would be there if it took no time, and telemetry none either.
-        sent: (k, m) what was sent.
-        seen: What was tracked, (n, m).
-        near: (m,) values that differ by less are the same.
+        expected_us: (k,) times without any delay.
+        sent: (k, m) setpoints.
+        seen: Tracked values (n, m).
+        near: (m,) tolerances of equality.
     """
     bounds = []
     for k in range(1, len(sent)):

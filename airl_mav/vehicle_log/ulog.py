@@ -132,11 +132,7 @@ class VehicleLog:
 
 
 def read_vehicle_log(path: Path) -> VehicleLog:
-    """Read a .ulg.
-
-    Raises:
-        UsageError: It cannot be read, is no ULog, or holds neither attitude nor velocity.
-    """
+    """Read a .ulg; raise UsageError without attitude or velocity."""
     accepted = "a ULog (.ulg) with vehicle_attitude and vehicle_local_position"
     try:
         with path.open("rb") as file:

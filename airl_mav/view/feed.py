@@ -50,13 +50,7 @@ class Asked:
     """What the watchers ask for. To be used from one thread at a time."""
 
     def __init__(self, ends: ViewEnds, default: Steering, clock: Clock | None = None) -> None:
-        """Connect.
-
-        Args:
-            ends: Where the view is.
-            default: What holds before it has said anything, and when it is gone.
-            clock: Of its silence; None: the wall clock.
-        """
+        """Connect to the view; `default` holds until it answers and after it is gone."""
         self._clock = clock or WallClock()
         self._heard_us = self._clock.time_us()
         self._default = self._newest = default

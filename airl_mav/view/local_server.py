@@ -26,11 +26,7 @@ Answering = Callable[[ServerConnection, Request], Response | None]
 
 
 def uncompressed(answering: Answering) -> Answering:
-    """Return the same without compression.
-
-    viser's page is compressed as it lies on the disk: once more takes longer than it saves on the
-    way to a browser of the same computer.
-    """
+    """Return the handler without compression, which only slows viser's page on one computer."""
 
     def answer(connection: ServerConnection, request: Request) -> Response | None:
         if "Accept-Encoding" in request.headers:

@@ -50,11 +50,7 @@ Floats = NDArray[np.float64]
 
 
 def walls(bounds: Bounds) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
-    """Return the four walls, and the ceiling where there is one, as a mesh whose front is inside.
-
-    Returns:
-        Corners (8, 3) NED [m], and the corners of the triangles (8 or 10, 3).
-    """
+    """Return walls and ceiling, fronts inside: corners (8, 3) NED [m] and triangles (n, 3)."""
     b = bounds
     ends = [
         (b.north_max, b.east_min),

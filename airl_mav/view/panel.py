@@ -35,15 +35,7 @@ class Panel:
         head: Callable[[], None] = lambda: None,
         latency: Callable[[], None] = lambda: None,
     ) -> None:
-        """Build it.
-
-        Args:
-            server: Whose.
-            run: What the run is called.
-            image: What the image is called.
-            head: Adds what may be set, below the title.
-            latency: Adds what may be set of the latency, below its strip.
-        """
+        """Build the panel; `head` and `latency` add controls below the title and the strip."""
         self._run = run
         gui: Any = server.gui
         gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
@@ -93,11 +85,7 @@ class Panel:
                 self._picture.image = camera_picture(shown.decided_image, range_m)
 
     def _add_picture(self) -> None:
-        """Add the image, below the numbers.
-
-        Not as the panel is built: what encodes images takes longer to import than the rest of the
-        panel to be on a page.
-        """
+        """Add the image below the numbers, late: its encoder takes longest to import."""
         order = self._numbers.order + 0.5
         self._picture = self._gui.add_image(BLANK, label=self._label, format="png", order=order)
 

@@ -54,12 +54,7 @@ NOTHING = "–"
 
 
 def camera_picture(image: Image, range_m: float) -> NDArray[np.uint8]:
-    """Return a camera's image for people, RGB (h, w, 3): of depth near is bright.
-
-    Args:
-        image: As `camera.frame.Frame.image`.
-        range_m: Farthest depth that the camera returns [m].
-    """
+    """Return a `Frame.image` as RGB (h, w, 3); depth up to `range_m` [m] is bright where near."""
     if image.ndim == 3:
         picture = rgb_of(image)
     else:

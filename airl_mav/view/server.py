@@ -83,13 +83,7 @@ class Controls:
             self._ask(speed=speeds.get(pace.value))
 
     def add_knob(self, *, compensable: bool, compensated: bool) -> None:
-        """Add what sets the latency.
-
-        Args:
-            compensable: Whether it can be compensated: the vehicle's response is known, and its
-                camera gives depth.
-            compensated: Whether it is, as the scenario says.
-        """
+        """Add the latency control, and that of compensation where the vehicle supports it."""
         gui = self._gui
         by_hand = gui.add_checkbox(
             "Set t2 by hand", False, hint="The flight then counts in no statistics."

@@ -44,9 +44,9 @@ class Hand:
         self._as_asked = compensate
 
     def t2_us(self) -> int | None:
-        """Return the latency that is set for the coming decision [µs]; None: the scenario's.
+        """Return the viewer's latency for the next decision [µs]; None = the scenario's.
 
-        What the watchers want is asked here, once a decision and before its time begins.
+        Called once per decision, before its simulated time begins.
         """
         self._known = self._newest()
         t2_ms = self._known.t2_ms

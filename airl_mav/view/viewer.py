@@ -41,7 +41,7 @@ class Viewer:
     """A page that shows flights, until it is closed."""
 
     def __init__(self, request: Request) -> None:
-        """Start it and wait until it can be opened.
+        """Start the viewer and wait until it serves.
 
         Raises:
             FieldError: The port is taken.

@@ -34,17 +34,7 @@ NEAREST_M = 1.0
 def unhidden(
     arena: Arena, time_us: int, at: NDArray[np.float64], offset: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return a camera's place from what it looks at (3,) NED [m], with nothing in between.
-
-    Args:
-        arena: Where both are.
-        time_us: Time since the episode began [µs].
-        at: What is looked at (3,) NED [m].
-        offset: Where the camera would be from there (3,) NED [m].
-
-    Returns:
-        `offset`, or the part of it that ends before the first obstacle.
-    """
+    """Return the camera's offset from its target NED [m], shortened to before any obstacle."""
     # Imported here: without numba a view has its page ready sooner than a browser opens it.
     from airl_mav.camera.render import render
 

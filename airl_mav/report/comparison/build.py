@@ -53,13 +53,12 @@ def compare(
     """Compare runs.
 
     Args:
-        runs: By name, in the order of the tables, one or more.
-        contrasts: Which run is compared with which reference, by their names; None: every run with
-            the first.
-        kind: Names the files of the comparison.
-        title: One line for people.
-        facts: What was asked for.
-        entries: What is known of the runs besides their flights; none: their names.
+        runs: Runs by name, in the order of the tables.
+        contrasts: Names of run and reference; None = every run against the first.
+        kind: Kind of comparison; prefix of its files.
+        title: One line.
+        facts: Settings of the comparison.
+        entries: Descriptions of the runs; empty = their names only.
 
     Raises:
         UsageError: There is no run, a run holds no flight, or a seed twice.

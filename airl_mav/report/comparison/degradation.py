@@ -41,15 +41,7 @@ def curves_picture(
     series: Sequence[Series],
     paper: Sequence[tuple[float, float]] = (),
 ) -> theme.Picture:
-    """Draw series over a common axis.
-
-    Args:
-        name: File name without suffix.
-        title: What is drawn.
-        labels: Of both axes, with their units.
-        series: The lines; intervals are drawn where they are known.
-        paper: Points that the paper has.
-    """
+    """Draw series with their known intervals, and the paper's points, over a common axis."""
     figure = theme.new_figure(4.2, 3.0 + 0.2 * (len(series) + bool(paper)))
     ax: Axes = figure.subplots()
     for index, line in enumerate(series):
@@ -96,10 +88,9 @@ FEWEST = 10
 def build_degradation(
     facts: Mapping[str, Any], entries: Sequence[RunEntry], runs: Mapping[str, LoadedRun]
 ) -> Comparison:
-    """Work out a degradation curve for every policy; see `show.build_comparison`.
+    """Return a degradation curve for every policy; see `show.build_comparison`.
 
-    The facts are what all runs share: `arena`, ... The entries stand by policy, then by growing
-    latency, the reference first; their `label` is the latency, their `group` the policy.
+    Entries are sorted by policy (`group`), then by latency (`label`), the reference first.
     """
     contrasts: list[ContrastEntry] = []
     for policy in dict.fromkeys(entry.group for entry in entries):

@@ -24,10 +24,7 @@ WIDEST = 3
 
 
 def worst_seeds(reference: Sequence[EpisodeRecord], target: Sequence[EpisodeRecord]) -> list[int]:
-    """Return seeds that lost most: half of them failed, half took longest against the reference.
-
-    The reference reached the goal with all of them. Of those that failed the first seeds are taken.
-    """
+    """Return the seeds that lost most: half failures, half the slowest against the reference."""
     failed: list[int] = []
     slower: dict[int, float] = {}
     for first, second in pair_by_seed(reference, target):
@@ -43,11 +40,7 @@ def worst_seeds(reference: Sequence[EpisodeRecord], target: Sequence[EpisodeReco
 
 
 def split_seeds(runs: Mapping[str, LoadedRun]) -> list[dict[str, Any]]:
-    """Return the seeds of which not all flights reached the goal, but one did.
-
-    Returns:
-        For each its `seed`, and its `outcomes` by run; invalid flights are left out.
-    """
+    """Return `seed` and `outcomes` by run of the seeds that only some runs completed."""
     flights: dict[int, dict[str, EpisodeRecord]] = {}
     for name, run in runs.items():
         for episode in tests_of(run):
@@ -60,10 +53,7 @@ def split_seeds(runs: Mapping[str, LoadedRun]) -> list[dict[str, Any]]:
 
 
 def widest_seeds(reference: LoadedRun, level: LoadedRun) -> dict[str, Any] | None:
-    """Return the median difference in flight time and the seeds of the widest [%].
-
-    None with fewer than three common successes.
-    """
+    """Return median and extreme time differences [%]; None below three common successes."""
     percent = {
         first.seed: 100.0 * (second.quality.flight_time_s / first.quality.flight_time_s - 1.0)
         for first, second in pair_by_seed(reference.episodes, level.episodes)
@@ -91,15 +81,7 @@ def comparison_document(
 ) -> Document:
     """Return the document of a comparison; its parts are those of `Document`.
 
-    Args:
-        comparison: What is shown.
-        runs: Its runs by name.
-        folder: Where the document goes: links to the runs start there.
-        kicker: Kind of the document; the date is added.
-        sections: What it says.
-        facts: What was flown.
-        lead: One sentence under the title.
-        facts_title: Heading of the facts.
+    Links to the runs are relative to `folder`. The date is added to the `kicker`.
     """
     first = comparison.runs[0]
     made = runs[first.name].info

@@ -48,14 +48,7 @@ def contrast_pictures(
     *,
     medians: bool = False,
 ) -> list[theme.Picture]:
-    """Draw contrasts with their intervals, one picture a measure, published ones beside them.
-
-    Args:
-        prefix: What the pictures' names begin with.
-        comparison: Of the contrasts.
-        contrasts: One or more, from top to bottom.
-        medians: Whether the medians of the pairs are drawn too.
-    """
+    """Draw contrasts with intervals, one picture per measure, published values beside them."""
     names = [contrast_head(comparison, each) for each in contrasts]
     pictures = []
     for measure in MEASURES:

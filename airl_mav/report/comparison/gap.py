@@ -170,10 +170,9 @@ several runs: one for each source of latency."""
 def build_gap(
     facts: Mapping[str, Any], entries: Sequence[RunEntry], runs: Mapping[str, LoadedRun]
 ) -> Comparison:
-    """Work out the gaps, the published ones beside them, the worst seeds and the verdict.
+    """Return the gaps beside published ones, the worst seeds and the verdict.
 
-    See `show.build_comparison`; facts are `policy`, `computer`, `reference`, `latency`, ..., each
-    entry has its `role`, and its group is the arena.
+    See `show.build_comparison`. Each entry has its `role`; its `group` is the arena.
     """
     contrasts = [
         replace(kind, target=target.name, reference=reference.name)
@@ -219,11 +218,7 @@ def build_gap(
 
 
 def _published_columns(comparison: Comparison, arena: str) -> tuple[str, dict[str, PublishedRun]]:
-    """Return the published columns that are the same as ours: its computers, as late as there.
-
-    Returns:
-        Title of the table, and its columns by the names of our runs; empty where none fits.
-    """
+    """Return title and published columns, by our runs' names, of the same computers and latency."""
     facts = comparison.facts
     asked = facts.get("computer"), facts.get("reference"), facts.get("latency")
     if asked == ("ras-pi-4", "workstation", None):

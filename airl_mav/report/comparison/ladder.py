@@ -32,10 +32,7 @@ MAX_SPLIT = 50
 def build_ladder(
     facts: Mapping[str, Any], entries: Sequence[RunEntry], runs: Mapping[str, LoadedRun]
 ) -> Comparison:
-    """Work out a ladder of levels, the reference first; see `show.build_comparison`.
-
-    The facts are what all levels share: `policy`, `arena`, ...
-    """
+    """Compare a ladder of levels with the first; see `show.build_comparison`."""
     title = f"{facts.get('policy')} in {facts.get('arena')}"
     comparison = compare(runs, kind="ladder", title=title, facts=facts, entries=entries)
     widest = {

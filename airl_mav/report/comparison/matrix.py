@@ -20,11 +20,7 @@ from airl_mav.report.table import NONE, Column, TableView
 def build_matrix(
     facts: Mapping[str, Any], entries: Sequence[RunEntry], runs: Mapping[str, LoadedRun]
 ) -> Comparison:
-    """Work out a table of policies x arenas; see `show.build_comparison`.
-
-    The facts are what all cells share: level, seed, episodes, vehicle, computer. The `label` of an
-    entry is the policy, its `group` the arena.
-    """
+    """Return a table of policies (`label`) by arenas (`group`); see `show.build_comparison`."""
     title = "Policies by arenas"
     return compare(runs, (), kind="matrix", title=title, facts=facts, entries=entries)
 

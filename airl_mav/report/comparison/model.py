@@ -63,10 +63,7 @@ class ContrastEntry:
 
 
 def part_of(entry: RunEntry) -> str:
-    """Return what a run is in its comparison: its name without the group that it stands in.
-
-    In words, so that narrow columns can break it.
-    """
+    """Return a run's name without its group, as words, so that narrow columns can break it."""
     return entry.name.removeprefix(f"{Path(entry.group).stem}-").replace("-", " ")
 
 

@@ -42,14 +42,11 @@ def compare_folders(
 
     Args:
         paths: Run folders; the folder of a comparison stands for its runs.
-        names: What the runs are called, in the same order; none: what tells them apart.
-
-    Returns:
-        The comparison, and its runs by name.
+        names: Names of the runs, in the same order; empty = derived from the folders.
 
     Raises:
-        UsageError: A folder holds no run, or one of no flights; fewer than two runs; one twice;
-            names that do not fit.
+        UsageError: A folder is no run or has no flights; fewer than two runs; one twice; names that
+            do not fit.
     """
     folders = [folder for path in paths for folder in run_folders(path)]
     if len(folders) < 2:

@@ -66,13 +66,10 @@ def build_comparison(
     """Read runs and compare them as a kind of comparison does.
 
     Args:
-        folder: Of the comparison: the runs lie in it.
-        kind: Which comparison; its module says what it asks of facts and entries.
-        facts: What was asked for, and all runs share.
+        folder: Folder of the comparison, which contains the runs.
+        kind: Kind; its module documents the facts and entries that it needs.
+        facts: Settings that all runs share.
         entries: The runs, in the order of the tables.
-
-    Returns:
-        The comparison, and its runs by name.
 
     Raises:
         UsageError: There is no run, one cannot be read, or holds no flight.
@@ -93,19 +90,11 @@ def rebuild_comparison(folder: Path) -> tuple[Comparison, dict[str, LoadedRun]]:
 def judge_comparison(
     comparison: Comparison, loaded: Runs, requirements: Sequence[Requirement] = ()
 ) -> OverallVerdict:
-    """Return the verdict of a comparison.
+    """Return the verdict of a comparison; FieldError if a gap is required without any reference.
 
-    A hardware gap is judged by the run that would be deployed: the mitigated policy on the onboard
-    computer, where one flies, or else the policy itself. Every run of another comparison has to
-    meet what is required of it; a gap is required of those that have a reference.
-
-    Args:
-        comparison: The comparison.
-        loaded: Its runs by name.
-        requirements: What is asked.
-
-    Raises:
-        FieldError: A gap is required, and no run has a reference.
+    A hardware gap is judged by the run to deploy: the mitigated policy on the onboard computer if
+    flown, otherwise the policy itself. In other comparisons every run must meet the requirements; a
+    required gap applies to runs with a reference.
     """
     against = {c.entry.target: c for c in reversed(comparison.contrasts)}
     if not against and (gaps := [each for each in requirements if each.gap]):
@@ -154,16 +143,13 @@ def write_comparison(
     folder: Path,
     verdict: OverallVerdict | None = None,
 ) -> Path:
-    """Write `<kind>.json`, `verdict.json`, `.html`, `.md` and the PNG files, each whole or not.
+    """Write `<kind>.json`, `verdict.json`, `.html`, `.md` and PNG files; return the page's path.
 
     Args:
-        comparison: What is written.
+        comparison: The comparison.
         loaded: Its runs by name, for the pictures.
-        folder: Where to.
-        verdict: Heads the page; None: it is judged by what was last asked of this folder.
-
-    Returns:
-        The path of the page.
+        folder: Output folder.
+        verdict: Verdict of the page; None = judged by the folder's last requirements.
 
     Raises:
         UsageError: The folder cannot be written.

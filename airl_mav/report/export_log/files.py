@@ -16,22 +16,12 @@ Format = Literal["mcap", "ulog"]
 
 
 def flight_of(run: ReplayedRun, index: int) -> RecordedFlight:
-    """Return a flight of a run.
-
-    Raises:
-        UsageError: It is not there, or its arena cannot be made any more.
-    """
+    """Return a flight of a run; raise UsageError if the flight or its arena is missing."""
     return RecordedFlight(run.flight(run.record(index)), run.info)
 
 
 def write_flight(flight: RecordedFlight, run: Path, out: Path, kind: Format) -> Path:
-    """Write a flight's file into a folder, and return its path.
-
-    The flight controller's own log, where the run has it, is the ULog: it holds more.
-
-    Raises:
-        OSError: It cannot be written.
-    """
+    """Write a flight's file into a folder and return its path; a recorded ULog is copied."""
     name = f"flight-{flight.replayed.record.index:03d}"
     if kind == "mcap":
         # Imported here: MCAP and Foxglove's messages are extras.

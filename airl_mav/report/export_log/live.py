@@ -33,11 +33,7 @@ class LiveFlight(ServerListener):
     """
 
     def __init__(self, flight: RecordedFlight, port: int) -> None:
-        """Serve on a TCP port of the loopback address; 0 takes a free one.
-
-        Raises:
-            FieldError: The port is taken.
-        """
+        """Serve on a loopback TCP port, 0 = any free one; raise FieldError if it is taken."""
         messages = FlightMessages(flight)
         self._began_unix_us = messages.began_unix_us
         self._told = list(messages)
@@ -89,10 +85,9 @@ class LiveFlight(ServerListener):
         channel.log(data, log_time=time_ns)
 
     def wait(self, timeout_s: float | None = None) -> bool:
-        """Wait until somebody watches all that they want to; return whether somebody does.
+        """Wait until a viewer has subscribed to its topics; return whether there is one.
 
-        A viewer subscribes to one topic after the other: what is told before the server has taken
-        its subscription is lost on it.
+        Viewers subscribe topic by topic; a message sent before the subscription is lost.
         """
         if not self._watched.wait(timeout_s):
             return False

@@ -16,11 +16,7 @@ from airl_mav.report.export_log.told import FlightMessages
 
 
 def write_mcap(flight: RecordedFlight, path: Path) -> None:
-    """Write a flight; what is there already is replaced.
-
-    Raises:
-        OSError: It cannot be written.
-    """
+    """Write a flight as MCAP, replacing an existing file."""
     messages = FlightMessages(flight)
     with replacing(path) as partial, partial.open("wb") as opened:
         file = McapFile(opened, run_of(flight))

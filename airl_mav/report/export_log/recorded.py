@@ -82,10 +82,7 @@ class Charge:
 
 
 def charge_of(flight: RecordedFlight) -> Charge | None:
-    """Return the battery, worked out from the recorded power as the simulator does.
-
-    None where the power is no simulator's.
-    """
+    """Return the battery, computed from simulated power as in the simulator, otherwise None."""
     path, battery = flight.truth, flight.replayed.vehicle.battery
     if path is None:
         return None
@@ -105,10 +102,7 @@ def charge_of(flight: RecordedFlight) -> Charge | None:
 
 
 def decision_messages(flight: RecordedFlight) -> list[Decision]:
-    """Return the decisions as a black box has them.
-
-    The state that a decision saw is that of the moment at which its inference began.
-    """
+    """Return the decisions as black-box messages, with the state at the start of inference."""
     columns, believed = flight.decisions, flight.believed
     setpoints = columns.get(setpoint_column(columns) or SETPOINT, np.zeros((0, 4)))
     goal = flight.replayed.record.goal

@@ -63,13 +63,10 @@ Sample = tuple[int, str, Values]
 
 
 def write_ulog(flight: RecordedFlight, path: Path) -> None:
-    """Write a flight; what is there already is replaced.
+    """Write a flight as ULog, replacing an existing file.
 
-    A flight with a vehicle's log may begin before the companion did, whose clock it has: times of a
-    ULog are not negative, so all are then later by as much.
-
-    Raises:
-        OSError: It cannot be written.
+    ULog times are not negative: if the vehicle's log begins before the companion, all times are
+    shifted.
     """
     began_us = int(flight.replayed.path.time_us[0])
     later_us = max(0, -began_us)
@@ -116,12 +113,7 @@ def samples(flight: RecordedFlight) -> Iterator[Sample]:
 
 
 def row(topic: str, **known: Any) -> Values:
-    """Return the values of a topic's fields, of which some are known.
-
-    Raises:
-        ValueError: An array has another length than its field.
-        KeyError: The topic has no such field.
-    """
+    """Return the values of a topic's fields, unknown ones as defaults; check names and lengths."""
     values: list[float | int | bool] = []
     for field in EXPORTED[_NUMBER[topic]].fields:
         kind, name = field.split()

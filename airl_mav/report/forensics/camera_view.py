@@ -93,25 +93,13 @@ def headings(quaternions: Floats) -> Floats:
 
 
 def bearing(quaternion: Floats, offset: Floats) -> float:
-    """Return where a thing lies [rad]: from the heading, positive to the right, -pi to pi.
-
-    Args:
-        quaternion: (4,) body to NED.
-        offset: (2,) or more, from the vehicle to the thing, north and east first [m].
-    """
+    """Return the bearing [rad] from the heading, positive right, of an offset NED [m]."""
     angle = math.atan2(offset[1], offset[0]) - heading_rad(quaternion)
     return math.remainder(angle, 2.0 * math.pi)
 
 
 def nearest_spot(obstacles: Obstacles, i: int, center: Floats, position: Floats) -> Floats:
-    """Return the point (2,) of an obstacle's outline from above that is nearest to a position.
-
-    Args:
-        obstacles: All of them.
-        i: Which one.
-        center: (3,) where it is [m].
-        position: (3,) NED [m].
-    """
+    """Return the point (2,) of obstacle i's outline from above nearest to a position NED [m]."""
     offset = position[:2] - center[:2]
     if obstacles.shape[i] == Shape.BOX:
         cos, sin = math.cos(float(obstacles.yaw[i])), math.sin(float(obstacles.yaw[i]))
@@ -133,15 +121,15 @@ def view_obstacle(
     i: int,
     camera: PolicyCamera,
 ) -> ObstacleView:
-    """Return where obstacle i was on the frame of `frame_us`, and how much of it was to be seen.
+    """Return the direction and visibility of obstacle i on the frame exposed at `frame_us`.
 
     Args:
         path: The flight.
         frame_us: Exposure of the frame [µs].
-        hit_us: When the obstacle was hit [µs].
-        arena: Where it flew.
-        began_us: Start of the episode, from which moving obstacles count [µs].
-        i: Number of the obstacle.
+        hit_us: Time of the collision [µs].
+        arena: The arena.
+        began_us: Start of the episode, and of the obstacles' motion [µs].
+        i: Index of the obstacle.
         camera: The camera.
     """
     position, _, quaternion = pose_at(path, frame_us)

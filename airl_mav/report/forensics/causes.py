@@ -77,10 +77,7 @@ class Collision:
 
 
 def decisions_in_effect(stamps: Mapping[str, NDArray[Any]], ended_us: int) -> NDArray[np.int64]:
-    """Return the numbers of the decisions that moved the motors before a time [µs].
-
-    Where nothing says when the motors answered, a decision acts when it is sent.
-    """
+    """Return the decisions that moved the motors before a time; otherwise those sent."""
     if "sent_us" not in stamps or "capture_us" not in stamps:
         return np.zeros(0, np.int64)
     acts = stamps["sent_us"]

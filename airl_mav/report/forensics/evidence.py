@@ -95,11 +95,7 @@ def path_excess(record: EpisodeRecord) -> float | None:
 
 
 def ranked(run: LoadedRun) -> list[EpisodeRecord]:
-    """Return all flights, the worst first.
-
-    Those that failed come first, then those that reached the goal; each by the time they lost, or
-    took where no flight reached the goal.
-    """
+    """Return all flights, worst first: failures, then successes, each by the time they lost."""
     usual = usual_flight(run.episodes)
 
     def key(e: EpisodeRecord) -> tuple[bool, float, int]:

@@ -74,14 +74,7 @@ def swinging_stretches(command: NDArray[np.floating[Any]]) -> list[NDArray[np.in
 def longest_limit_cycle(
     stamps: Mapping[str, NDArray[Any]], path: Trajectory, ended_us: int
 ) -> LimitCycle | None:
-    """Return the longest limit cycle on the spot, or else the longest one; None without any.
-
-    Args:
-        stamps: The decisions: `sent_us` (n,) [µs] and `setpoint` (n, 4), velocity forward, right,
-            down [m/s] and yaw rate [rad/s].
-        path: The flight.
-        ended_us: Its end [µs].
-    """
+    """Return the longest limit cycle on the spot, or else the longest one; None without any."""
     if "setpoint" not in stamps or "sent_us" not in stamps or not len(path):
         return None
     sent = stamps["sent_us"]
@@ -100,14 +93,7 @@ def longest_limit_cycle(
 def _swings(
     kind: str, turns_us: NDArray[np.int64], end_us: int, path: Trajectory
 ) -> list[LimitCycle]:
-    """Return a stretch as a whole, and the part of it on the spot if there is one.
-
-    Args:
-        kind: As in `LimitCycle`.
-        turns_us: (k,) times of the changes of side [µs].
-        end_us: Its end [µs].
-        path: The flight.
-    """
+    """Return a stretch as a whole, and the part of it on the spot if there is one."""
     start_us = int(turns_us[0])
     swings = [LimitCycle(kind, len(turns_us), start_us, end_us, on_the_spot=False)]
     part = path.between(start_us, end_us)

@@ -66,13 +66,7 @@ def flown_path(run: LoadedRun, record: EpisodeRecord) -> Trajectory | None:
 def examine_worst(
     run: LoadedRun, arenas: Mapping[int, Arena], vehicle: VehicleProfile | None
 ) -> list[ExaminedFlight]:
-    """Return the worst flights of a run, `EXAMINED` at most, each with its cause.
-
-    Args:
-        run: The run.
-        arenas: Arenas by episode index; where one is missing the cause says less.
-        vehicle: What flew; None says less too.
-    """
+    """Return the worst flights, at most `EXAMINED`, with their causes as far as data allow."""
     usual = usual_flight(run.episodes)
     camera = None if vehicle is None else PolicyCamera.of(vehicle.camera)
     brake = None if vehicle is None else partial(_braking_m, vehicle)

@@ -214,10 +214,7 @@ class ReplayedFlight:
 
 
 def parting_s(first: ReplayedFlight, other: ReplayedFlight) -> float | None:
-    """Return when two flights part [s since the reset]: at the first decision that differs.
-
-    That is the exposure of its image in the first flight; None: no decision differs.
-    """
+    """Return the exposure [s since reset] of the first different decision; None = equal."""
     column = setpoint_column(first.stamps)
     if column is None or column not in other.stamps:
         return None

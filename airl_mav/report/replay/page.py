@@ -55,14 +55,14 @@ class ReplayPage:
         first: EpisodeRecord | None = None,
         runs: ReplayedRuns | None = None,
     ) -> None:
-        """Build the page, as it is at the beginning of the first flight.
+        """Build the page at the start of a flight.
 
         Args:
-            server: Whose.
-            run: What is replayed.
-            beside: The run whose flights of the same seeds fly beside; None: alone.
-            first: The flight that is shown first; None: the worst.
-            runs: Those that can be chosen, these two among them; None: no others.
+            server: The server.
+            run: The run to replay.
+            beside: A run to show beside it, by seed; None = none.
+            first: The first flight; None = the worst.
+            runs: Selectable runs; None = no others.
         """
         self._run, self._beside, self._runs = run, beside, runs
         self._shown, self._others = Shown(), Shown()
@@ -156,10 +156,7 @@ class ReplayPage:
     # --- where it is
 
     def _open(self, way: ReplayedFlight) -> None:
-        """Show a flight first as it flew, then with its arena, which takes a while to be made.
-
-        Whoever opens the page finds all that there is by then, without asking for it.
-        """
+        """Show a flight at once and add its arena when ready; late viewers get both."""
         self._flight: ReplayedFlight = way
         way.begin(self._shown)
         self._shown.is_surrounded = False

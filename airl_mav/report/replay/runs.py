@@ -16,10 +16,7 @@ from airl_mav.report.replay.flight import ReplayedFlight
 
 
 def run_folders(path: Path) -> list[Path]:
-    """Return the folders of a campaign's runs, by their names; of anything else the path itself.
-
-    Raises UsageError for a campaign of which nothing has been flown.
-    """
+    """Return a campaign's run folders, or the path itself; UsageError if it is empty."""
     if not (path / CAMPAIGN_FILE).is_file():
         return [path]
     found = sorted(file.parent for file in path.glob(f"*/{RUN_FILE}"))
@@ -63,12 +60,7 @@ class ReplayedRun:
     """A run folder; what a flight needs beside its record is made when it is asked for."""
 
     def __init__(self, path: Path) -> None:
-        """Read a run folder.
-
-        Raises:
-            UsageError: The folder holds no run, no flight of it was recorded, or a profile of it
-                cannot be found any more.
-        """
+        """Read a run folder; UsageError if no flight was recorded or a profile is missing."""
         self._run: LoadedRun = load(path)
         self._vehicle: VehicleProfile = vehicle_of(self._run.info)
         self.path, self.info = path, self._run.info
