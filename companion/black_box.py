@@ -83,15 +83,7 @@ class BlackBoxRecorder:
         goal: Goal,
         images_hz: float,
     ) -> None:
-        """Take what to record.
-
-        Args:
-            file: New.
-            link: Connected.
-            clock: The companion's.
-            goal: North, east of the start [m], and down where it has a height.
-            images_hz: Most images to keep, each one that a decision saw [Hz].
-        """
+        """Record into a new file at most `images_hz` images per second [Hz], of decisions."""
         self.failure: str | None = None
         """Why the file ends early."""
         self._file, self._link, self._clock, self._goal = file, link, clock, goal
@@ -154,10 +146,7 @@ class BlackBoxRecorder:
             self._clock.sleep_until(next_us, self._ended)
 
     def record(self, now_us: int, *, last: bool = False) -> None:
-        """Write what was told since, and a sample of now; `last` closes the file.
-
-        Nothing happens after a file that could not be written.
-        """
+        """Write new data and a sample; `last` closes the file. No effect after a write error."""
         if self.failure is not None:
             return
         try:
@@ -250,17 +239,14 @@ def open_recorder(
     clock: Clock,
     goal: Goal,
 ) -> BlackBoxRecorder:
-    """Return what records a mission into a new file of a folder.
+    """Return the recorder of a mission into a new file of a folder, or raise FieldError.
 
     Args:
-        folder: Made, if it is not there.
-        run: What flies: `setup` and `config`, as `run.json` has them.
+        folder: Output folder.
+        run: `setup` and `config` of `run.json`.
         link: Connected.
         clock: The companion's.
         goal: North, east of the start [m], and down where it has a height.
-
-    Raises:
-        FieldError: No file can be written there.
     """
     now = utc_now()
     made = {

@@ -43,10 +43,7 @@ class FrameSource(Protocol):
         ...
 
     def wait(self, newer_than_sequence: int, timeout_s: float) -> ReceivedFrame | None:
-        """Wait for a frame that is not the one already seen (its sequence; -1 = none).
-
-        Returns the newest frame, or None when the time is over [wall s].
-        """
+        """Wait for a frame other than a sequence (-1 = none); None after a timeout [wall s]."""
         ...
 
 
@@ -64,8 +61,8 @@ class ZmqFrameSource:
     ) -> None:
         """Connect to an endpoint such as "tcp://192.168.1.2:5560"; the publisher may start later.
 
-        The clock, of simulated time, is for the stamps. A ZeroMQ context may be shared; None = one
-        of its own. Raises FieldError for an unusable endpoint.
+        The clock of simulated time stamps frames. `context` = a ZeroMQ context to share. Raises
+        FieldError for an unusable endpoint.
         """
         self.malformed = 0
         """Messages that were no frames, or frames of another size than the first one's."""
@@ -118,11 +115,7 @@ class ZmqFrameSource:
         self._socket.connect(self._endpoint)
 
     def _known(self, frame: Frame) -> Frame:
-        """Return a frame of this camera.
-
-        Whoever flies by its images keeps some of them: they have one size for a whole flight.
-        Raises FrameError for one of another size than the first.
-        """
+        """Return a frame, or raise FrameError if its size differs from the first one's."""
         if self._newest is not None:
             known = self._newest.frame
             if (frame.intrinsics, frame.lenses) != (known.intrinsics, known.lenses):
@@ -130,10 +123,7 @@ class ZmqFrameSource:
         return frame
 
     def wait(self, newer_than_sequence: int, timeout_s: float) -> ReceivedFrame | None:
-        """Wait for a frame that is not the one already seen; see `FrameSource`.
-
-        A lower sequence also counts as newer: the simulator was restarted.
-        """
+        """Wait for a frame, see `FrameSource`; lower sequences are newer: a simulator restart."""
         stopwatch = WallClock()
         while True:
             newest = self.latest()

@@ -53,10 +53,7 @@ class Finding(NamedTuple):
 def check_on_ground(
     asked: StandAloneCompanion, mission: Mission, stop: threading.Event
 ) -> Iterator[Finding]:
-    """Look at everything that a flight needs, one thing after the other.
-
-    What needs a part that is not there is left out. `stop`, set from outside, ends it early.
-    """
+    """Check a flight's requirements one by one, skipping absent parts, until `stop` is set."""
     clock = WallClock(asked.speed)
     yield Finding("policy", True, f"{asked.policy}, holds an action {mission.pilot.hold_s:g} s")
     with held_to(asked.cpu_quota):

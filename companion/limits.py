@@ -130,9 +130,9 @@ class Limits:
         Args:
             settings: The bounds.
             goal: North, east of the start [m], and down where it has a height.
-            pilot: How the policy is flown.
-            mount_pitch_up_rad: How far the camera looks up, as it is mounted [rad].
-            mount_yaw_rad: How far it looks to the right of the nose, as it is mounted [rad].
+            pilot: Settings of the pilot.
+            mount_pitch_up_rad: Pitch of the camera mount, up [rad].
+            mount_yaw_rad: Yaw of the camera mount, right [rad].
         """
         self.ending: Ending | None = None
         """What has ended the flight."""
@@ -150,14 +150,7 @@ class Limits:
         seen: ReceivedFrame | None,
         now_us: int,
     ) -> Ending | None:
-        """Return why the flight may not go on; None: it may.
-
-        Args:
-            status: Who flies.
-            state: What telemetry says.
-            seen: A frame that was not looked at before; None: there is none.
-            now_us: The time of the companion's clock [µs].
-        """
+        """Return the broken limit at `now_us`, or None; `seen` is a new frame, if any."""
         if self.not_ours(status, now_us) is None:
             self.ending = self._vehicle.broken(status, state, now_us)
         if self.ending is None and seen is not None:
@@ -345,10 +338,7 @@ class CameraLimits:
 
 
 def _dead(image: NDArray[Any]) -> bool:
-    """Return whether an even picture is all black, as of a covered or broken camera, or all white.
-
-    Any other even picture may be a wall without texture.
-    """
+    """Return whether a uniform picture is black or white (covered camera), not a plain wall."""
     return bool((image[0, 0] == image.flat[0]).all()) and int(image.flat[0]) in (0, 255)
 
 
@@ -361,11 +351,7 @@ def _reading(frame: Frame) -> str:
 def ground_in_view(
     frame: Frame, state: Kinematics, mount_pitch_up_rad: float, mount_yaw_rad: float = 0.0
 ) -> bool:
-    """Return whether a camera must see the ground, taken to be as high as the start.
-
-    It must where the ray through the middle of the bottom row meets it within `GROUND_M`. Ahead, a
-    cylinder's rows lie as a pinhole's do.
-    """
+    """Return whether flat ground must be in view: the lowest middle ray hits within `GROUND_M`."""
     lens = frame.intrinsics
     below_rad = math.atan2(lens.height - 1 - lens.cy, lens.focal)
     if lens.projection == "fisheye":

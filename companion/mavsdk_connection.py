@@ -30,11 +30,10 @@ wall time: a process that was stopped must not repeat commands when it resumes."
 
 
 def open_connection(url: str, kind: ComponentType, system_id: int | None = None) -> Mavsdk:
-    """Return MAVSDK on a connection, with a component type in its heartbeat.
+    """Return MAVSDK on a connection, with a component type in its heartbeat, or raise UsageError.
 
-    The URL is such as `udpin://127.0.0.1:14540`, `serial:///dev/ttyAMA0:921600` or `raw://`. A
-    system id is that of the vehicle which the component is part of; None: MAVSDK's own for its
-    type. Raises UsageError if the URL is invalid or its port is taken.
+    URLs are such as `udpin://127.0.0.1:14540`, `serial:///dev/ttyAMA0:921600` or `raw://`.
+    `system_id` is that of the component's vehicle; None: MAVSDK's own.
     """
     # MAVSDK would log to standard output; errors are returned as results.
     log_subscribe(lambda *_: True)
@@ -54,10 +53,7 @@ def open_connection(url: str, kind: ComponentType, system_id: int | None = None)
 
 
 def first_autopilot(mavsdk: Mavsdk, timeout_s: float, stop: threading.Event | None = None) -> Any:
-    """Return the first flight controller that is found; None when none is in time [wall s].
-
-    Raises LinkError when `stop`, set from outside, breaks off the wait.
-    """
+    """Return the first flight controller or None after a timeout [wall s]; LinkError on `stop`."""
     stopwatch = WallClock()
     while (left_s := timeout_s - stopwatch.time_us() / US_PER_S) > 0.0:
         if stop is not None and stop.is_set():
@@ -70,15 +66,10 @@ def first_autopilot(mavsdk: Mavsdk, timeout_s: float, stop: threading.Event | No
 
 
 def exchange_raw(mavsdk: Mavsdk, sent: Callable[[bytes], None]) -> Callable[[bytes], None]:
-    """Take over the bytes of a `raw://` connection.
+    """Exchange the bytes of a `raw://` connection; return what takes incoming whole frames.
 
-    Args:
-        mavsdk: Opened on it.
-        sent: Called with every MAVLink frame that MAVSDK sends, from MAVSDK's own thread: it
-            must return at once and take no lock that somebody who feeds bytes may hold.
-
-    Returns:
-        What to feed MAVSDK with, whole frames, from one thread at a time.
+    `sent` gets every outgoing frame, in MAVSDK's thread: it must return at once and take no lock
+    that a feeding thread may hold. Feed from one thread at a time.
     """
     set_timeout(mavsdk, RAW_TIMEOUT_S)
     mavsdk.subscribe_raw_bytes_to_be_sent(sent)

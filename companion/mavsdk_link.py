@@ -85,10 +85,10 @@ class MavsdkLink:
 
         Args:
             url: MAVSDK connection.
-            clock: For time-outs.
+            clock: For timeouts.
             abandon: Set from another thread to end any wait.
-            heard: Whether the flight controller is received, where wall time cannot tell;
-                None = MAVSDK decides.
+            heard: Whether the flight controller is received, independent of wall time; None =
+                MAVSDK decides.
         """
         self.url = url
         self._clock = clock
@@ -109,10 +109,7 @@ class MavsdkLink:
         """The streams have been asked for since the last mission."""
 
     def connect(self, timeout_s: float, stop: threading.Event | None = None) -> None:
-        """Wait for a flight controller. Raises LinkError when none is heard in time [wall s].
-
-        `stop`, set from outside, breaks off the wait.
-        """
+        """Wait for a flight controller; LinkError after a timeout [wall s] or on `stop`."""
         system = first_autopilot(self._mavsdk, timeout_s, stop)
         if system is None:
             raise LinkError(f"no flight controller heard on {self.url} in {timeout_s:g} s")
@@ -125,13 +122,11 @@ class MavsdkLink:
         self._asked = True
 
     def prepare(self, timeout_s: float, stop: threading.Event | None = None) -> None:
-        """Make ready for a mission, on a connection that may have seen others.
+        """Prepare a connection that may have seen other missions.
 
-        The flight controller may be another one by now, or have been powered up again: nothing that
-        was heard before counts, and the streams are asked for anew. Right after `connect` there is
-        nothing to do. `stop`, set from outside, breaks off the wait.
-
-        Raises LinkError when none is heard in time [wall s], or it grants no streams.
+        The flight controller may be a different one or have restarted: cached state is dropped and
+        streams are requested anew, unless right after `connect`. Raises LinkError after a timeout
+        [wall s], without streams, or on `stop`.
         """
         if self._asked:
             self._asked = False
@@ -175,14 +170,10 @@ class MavsdkLink:
         set_timeout(self._mavsdk, seconds)
 
     def exchange_texts(self, heard: Callable[[str], None]) -> Callable[[str], None]:
-        """Exchange STATUSTEXTs with the flight controller; `connect` comes first.
+        """Exchange STATUSTEXTs with the connected flight controller; return the sender.
 
-        Args:
-            heard: Called with every text, from a thread of MAVSDK's: all telemetry that came before
-                has been taken in by then. It must return at once.
-
-        Returns:
-            What sends a text of at most 50 characters, behind all that was sent before.
+        `heard` gets every text in a thread of MAVSDK's, after all earlier telemetry, and must
+        return at once. The sender takes up to 50 characters and keeps the order of messages.
         """
         self._texts = texts = ServerUtility(self._system)
         self.hear_texts(heard)
@@ -219,9 +210,8 @@ class MavsdkLink:
     def missing_health(self, *, by_gps: bool = True) -> list[str]:
         """Return what the flight controller does not report as good, in words.
 
-        Without GPS MAVSDK's flags of positions say nothing: the global one stays false, the local
-        one comes and goes with messages that contradict each other (PX4 1.16). Whether it may be
-        armed in a mode that needs them is told apart.
+        Without GPS MAVSDK's position flags are meaningless: the global one stays false, the local
+        one alternates with contradicting messages (PX4 1.16). Armability is reported apart.
         """
         health = self._telemetry.health()
         needed = [flag for flag in self.dialect.health if by_gps or flag not in POSITION]
@@ -270,10 +260,7 @@ class MavsdkLink:
         )
 
     def hear_texts(self, heard: Callable[[str], None]) -> None:
-        """Have a function called with the texts of the flight controller, after `connect`.
-
-        It is called from a thread of MAVSDK's, and must return at once.
-        """
+        """Call a function with the connected flight controller's texts, in a thread of MAVSDK's."""
         self._telemetry.subscribe_status_text(lambda status, _: heard(status.text))
 
     def arm(
@@ -282,12 +269,11 @@ class MavsdkLink:
         stop: threading.Event,
         origin: tuple[float, float, float] | None = None,
     ) -> None:
-        """Wait until the flight controller reports good health, then arm.
+        """Wait until the flight controller reports good health, then arm; `stop` ends the wait.
 
-        Health is reported a few times a second, so right after a reboot the last report may be out
-        of date: it must have been good for a while, and a refused request is repeated. `stop`, set
-        from outside, ends the wait. A flight controller that does not know its place is told its
-        origin, if that is given: latitude, longitude [deg], altitude [m].
+        Right after a reboot a health report may be out of date: it must have been good for a while,
+        and a refused request is repeated. `origin` (latitude, longitude [deg], altitude [m]) is
+        sent to a flight controller without a position.
         """
         deadline_us = self._deadline(timeout_s)
         good_since_us, tell_us = self._clock.time_us(), self._clock.time_us()
@@ -320,10 +306,7 @@ class MavsdkLink:
         return now_us + int(ORIGIN_RETRY_S * US_PER_S)
 
     def takeoff(self, altitude_m: float, timeout_s: float, stop: threading.Event) -> None:
-        """Take off and return when the altitude above the start is reached.
-
-        `stop`, set from outside, ends the climb early.
-        """
+        """Take off and return at an altitude above the start, or on `stop`."""
         start_down = float(self.kinematics().position[2])
         self._call("take-off", lambda: self._action.set_takeoff_altitude(altitude_m))
         self._call("take-off", self._action.takeoff)
@@ -343,10 +326,10 @@ class MavsdkLink:
         self._pause(OFFBOARD_SETTLE_S)
 
     def await_offboard(self, stop: threading.Event) -> None:
-        """Send zero velocity until somebody else has switched a flying vehicle to offboard.
+        """Send zero velocity until a pilot has switched the vehicle to offboard, or on `stop`.
 
-        PX4 takes no switch to offboard without setpoints, and MAVSDK stops repeating them with
-        every heartbeat of another mode. `stop`, set from outside, ends the wait.
+        PX4 rejects offboard without setpoints, and MAVSDK stops them at each heartbeat of another
+        mode.
         """
         while not self._flies_offboard():
             self._check(None, stop=stop)
@@ -358,10 +341,7 @@ class MavsdkLink:
         return status.armed and status.offboard and bool(self._telemetry.in_air())
 
     def tell(self, text: str) -> None:
-        """Send a text for the pilot and the ground station, cut to 50 characters.
-
-        Lost where the flight controller does not forward it.
-        """
+        """Send a text of up to 50 characters, if forwarded, to the pilot and ground station."""
         if self._texts is None:
             self._texts = ServerUtility(self._system)
         self._texts.send_status_text(StatusTextType.INFO, text[:TEXT_CHARACTERS])

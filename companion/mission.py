@@ -75,24 +75,23 @@ def fly_mission(
     Args:
         link: Connected.
         frames: The camera.
-        policy: What decides.
+        policy: The policy.
         goal: North, east [m] from the start, and down where it has a height.
         clock: Simulated time.
-        stop: Set from outside to end the flight early; the vehicle then lands.
-        abandon: Set from outside to break off without landing: the vehicle has crashed. The same
-            event the link was made with.
+        stop: Set from outside to land early.
+        abandon: Set from outside to end without landing: the vehicle has crashed. The link's own
+            event.
         progress: Called with the name of each phase as it begins.
-        pilot_settings: How the policy is flown.
-        watchdog_settings: Bounds on silence.
-        limit_settings: What is believed, and how far is flown.
-        guard: Who looks after them.
-        latency: Where to draw t2 from, to fly as a slower computer.
-        compensator: Carries forward what is seen; None: the policy sees what is.
-        mount_pitch_up_rad: How far the camera looks up, as it is mounted [rad].
-        mount_yaw_rad: How far it looks to the right of the nose, as it is mounted [rad].
-        start: Whether this program arms, takes off and lands, or a pilot who hands the vehicle over
-            in flight and gets it back in Hold.
-        decided: Told every decision when it is sent; it must return at once.
+        pilot_settings: Settings of the pilot.
+        watchdog_settings: Timeouts.
+        limit_settings: Limits of the flight.
+        guard: Guard of the deadlines.
+        latency: Source of t2, to fly as a slower computer.
+        compensator: Predicts what the policy sees; None: no prediction.
+        mount_pitch_up_rad: Pitch of the camera mount, up [rad].
+        mount_yaw_rad: Yaw of the camera mount, right [rad].
+        start: Whether this program arms, takes off and lands, or a pilot hands over in flight.
+        decided: Callback for every decision, called when its setpoint is sent. Must not block.
     """
     watchdog = Watchdog(link, clock, watchdog_settings)
     navigating = False
@@ -195,10 +194,10 @@ def check_camera(
     stop: threading.Event,
     compensator: Compensator | None = None,
 ) -> None:
-    """Look at the camera before take-off.
+    """Check the first frame before take-off, if there is one before `stop`.
 
-    Without a frame nothing is known of it, and nothing is refused. `stop`, set from outside, ends
-    the wait for a first frame. Raises UsageError when policy or compensator cannot use it.
+    Raises:
+        UsageError: Policy or compensator cannot use it.
     """
     if not isinstance(policy, CameraBound) and compensator is None:
         return

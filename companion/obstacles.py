@@ -65,7 +65,7 @@ def obstacle_distance(
         camera: Its intrinsics.
         range_m: Its range [m].
         quaternion: Attitude of the vehicle (4,), body to NED.
-        pitch_up_rad: How far the camera looks up, as it is mounted [rad].
+        pitch_up_rad: Pitch of the camera mount, up [rad].
         now_us: Time since the program started [µs].
     """
     fov_rad = camera.horizontal_fov_rad
@@ -92,15 +92,7 @@ def obstacle_distance(
 def obstacles_told(
     link: Vehicle, frames: FrameSource, range_m: float, pitch_up_rad: float, clock: Clock
 ) -> AbstractContextManager[None]:
-    """Send the message from a thread, for as long as the context lasts and images come.
-
-    Args:
-        link: Connected.
-        frames: A depth camera.
-        range_m: Its range [m].
-        pitch_up_rad: How far it looks up, as it is mounted [rad].
-        clock: The companion's.
-    """
+    """Send the message of a depth camera from a thread while the context lasts."""
 
     def tell() -> None:
         received, now_us = frames.latest(), clock.time_us()

@@ -11,16 +11,7 @@ from airl_mav.core.clock import Clock
 
 @contextmanager
 def every(period_us: int, act: Callable[[], object], clock: Clock, name: str) -> Iterator[None]:
-    """Call `act` from a thread of that name, at once and then once a period.
-
-    What was missed while the thread was held up is not made up for in a burst.
-
-    Args:
-        period_us: Time from one call to the next [µs].
-        act: Called from the thread; must not raise.
-        clock: Whose time that is.
-        name: Of the thread.
-    """
+    """Call `act` at once and once per period [µs] in a named thread; missed calls are skipped."""
     ended = threading.Event()
 
     def go_on() -> None:

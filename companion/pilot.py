@@ -105,12 +105,9 @@ class Pilot:
         self.memory = DecisionMemory(1) if compensator is None else compensator.memory
 
     def fly(self, goal: Goal, stop: Event) -> str:
-        """Decide until the goal is reached, or something ends it; return why, in words.
+        """Decide until the goal is reached or the flight ends; return the reason in words.
 
-        Where that is a limit, `Limits.ending` has the details.
-
-        `stop`, set from outside, ends the flight.
-        Raises LinkError when the flight controller refuses setpoints.
+        `Limits.ending` describes a broken limit. Raises LinkError when setpoints are refused.
         """
         sequence = -1
         if self.limits is not None:
@@ -251,10 +248,6 @@ class Pilot:
 
 
 def age_of(seen: ReceivedFrame, now_us: int) -> int:
-    """Return how long ago a frame was taken, as far as this companion can tell [µs].
-
-    A camera on another machine may stamp by a clock of its own. Then its frame is taken to be as
-    old as it has been here.
-    """
+    """Return a frame's age [µs], at least since its arrival if stamped by another clock."""
     age_us = now_us - seen.frame.capture_time_us
     return age_us if 0 <= age_us <= OLDEST_FRAME_US else now_us - seen.received_us

@@ -42,7 +42,7 @@ def computer_status(
 
     Args:
         now_us: Time since the program started [µs].
-        cores_percent: Load of each core, 0 to 100 since the last message; the first 8 are told.
+        cores_percent: Load of each core, 0 to 100 since the last message; the first 8 count.
         ram_bytes: Memory in use, and all.
         celsius: Of the processor [°C]; None: not known.
     """
@@ -81,13 +81,7 @@ def _measured(now_us: int) -> dict[str, Any]:
 def present(
     link: Sender, clock: Clock, measure: Callable[[int], dict[str, Any]] = _measured
 ) -> AbstractContextManager[None]:
-    """Send the computer's status from a thread, for as long as the context lasts.
-
-    Args:
-        link: Connected.
-        clock: The companion's.
-        measure: Returns the fields of the message, from the present time [µs].
-    """
+    """Send the computer's status (`measure`) from a thread while the context lasts."""
     return every(
         PERIOD_US,
         lambda: link.send_message(MESSAGE, measure(clock.time_us())),

@@ -85,11 +85,7 @@ class Mission:
 
 
 def prepare(asked: StandAloneCompanion) -> Mission:
-    """Check all that can be wrong before a connection is opened, and load the policy.
-
-    Raises:
-        UsageError: The input cannot be used.
-    """
+    """Check the input and load the policy before any connection, or raise UsageError."""
     check_companion(asked)
     policy = find_policy(asked.policy, trust=asked.trust)
     pilot, watchdog = decide_piloting(asked, policy, PilotSettings.goal_radius_m)
@@ -210,14 +206,14 @@ def fly_alone(
     waiting: Callable[[], None],
     progress: Callable[[str, int], None],
 ) -> MissionResult:
-    """Fly one mission against whatever answers.
+    """Fly one mission with a real flight controller.
 
     Args:
-        asked: How the flight controller and the camera are reached.
-        mission: What is flown.
+        asked: Connections of flight controller and camera.
+        mission: The mission.
         stop: Set to land and end.
         abandon: Set to end without landing.
-        waiting: Called once the flight controller is waited for.
+        waiting: Called before waiting for the flight controller.
         progress: Called with each phase as it begins, and its time [µs].
 
     Raises:

@@ -32,13 +32,9 @@ _URL = re.compile(r"udp(?:in)?://(?P<host>[^:/]*):(?P<port>\d+)")
 
 @contextmanager
 def signed(url: str, key: Path | None) -> Iterator[str]:
-    """Yield what MAVSDK shall connect to: the URL itself, or with a key a proxy before it.
+    """Yield the URL for MAVSDK: the original, or with a key that of a proxy before it.
 
-    A LinkError that comes of it names the URL, and whether frames were refused: with another key
-    than the flight controller's nothing else is seen of it.
-
-    Raises:
-        UsageError: As `SigningProxy`.
+    A LinkError from it names the URL and rejected frames: a different key shows nothing else.
     """
     if key is None:
         yield url
@@ -57,15 +53,9 @@ class SigningProxy:
     """Passes a flight controller's verified frames to MAVSDK, and MAVSDK's, signed, back."""
 
     def __init__(self, url: str, key: Path) -> None:
-        """Bind, and begin.
+        """Bind and start the proxy of udpin://HOST:PORT, or raise UsageError.
 
-        Args:
-            url: Where the flight controller sends to: udpin://HOST:PORT; without a host only
-                this machine can reach it (0.0.0.0: all that are on its networks).
-            key: File of the signing key.
-
-        Raises:
-            UsageError: The key cannot be used, the URL is no such one, or its port is taken.
+        Without a host only this machine can reach it (0.0.0.0: all in its networks).
         """
         found = _URL.fullmatch(url)
         if found is None:

@@ -66,10 +66,9 @@ def _watchdog_us(environment: Mapping[str, str]) -> int | None:
 
 @contextmanager
 def service(environment: Mapping[str, str] = os.environ) -> Iterator[ServiceManager]:
-    """Give the service manager; as long as the context lasts it gets signs of life.
+    """Give the service manager, with watchdog pings from a thread while the context lasts.
 
-    They come from a thread: they say that this process runs and its interpreter is not held up.
-    Whether decisions come in time is the watchdog's to see (`companion.watchdog`).
+    They show that the interpreter runs; `companion.watchdog` checks that decisions come in time.
     """
     with closing(ServiceManager(environment)) as manager, ExitStack() as alive:
         if manager.watchdog_us is not None:

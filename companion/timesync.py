@@ -43,10 +43,7 @@ class TimesyncLink(MavsdkLink):
         self._hear_messages(MESSAGE, self._hear)
 
     def exchange(self, count: int, interval_s: float, stop: threading.Event) -> None:
-        """Send so many requests, one per interval [s], and wait for the answers.
-
-        `connect` comes first; `stop`, set from outside, ends it early.
-        """
+        """Send requests at an interval [s] after `connect`, and wait for the answers or `stop`."""
         asked_us = self._clock.time_us()
         for _ in range(count):
             if stop.is_set():

@@ -35,13 +35,9 @@ class TokenTurns:
     """Takes turns and gives them back. One flight; all but `_hear` on the companion's thread."""
 
     def __init__(self, stop: threading.Event, abandon: threading.Event, patience_s: float) -> None:
-        """Wait for nobody yet.
+        """Prepare; `patience_s` limits the wait for a turn or its frame [wall s, while running].
 
-        Args:
-            stop: Set when the companion is told to land, or to abandon the flight.
-            abandon: Set when it is told that there is nothing left to land.
-            patience_s: Longest wait for a turn, or for a frame that a turn names [s of wall time,
-                while this process runs].
+        `stop` and `abandon` are set on commands to land or to end without landing.
         """
         self.patience_s = patience_s
         self.frame = NO_FRAME
@@ -60,10 +56,7 @@ class TokenTurns:
 
     @contextmanager
     def taken(self, link: TextLink) -> Iterator[None]:
-        """Take turns on a connected link for as long as the context lasts, however it ends.
-
-        Raises Abandoned when none comes.
-        """
+        """Take turns on a connected link while the context lasts; Abandoned when none comes."""
         self._link = link
         self._send = link.exchange_texts(self._hear)
         self._await_turn()
@@ -77,11 +70,11 @@ class TokenTurns:
         self._end()
 
     def sleep(self, wake_us: int, interrupt: threading.Event | None) -> None:
-        """Give the turn back until simulated `wake_us` [µs]; see `conducted.Sleep`.
+        """Return the turn until simulated `wake_us` [µs]; see `conducted.Sleep`.
 
         Raises:
             Abandoned: No turn comes any more.
-            ValueError: Nobody could tell of that event: it is neither `stop` nor `frame_arrived`.
+            ValueError: The event is neither `stop` nor `frame_arrived`.
         """
         sent = 0 if self._link is None else self._link.setpoints_sent
         self._give_back(TurnBack(self._number, wake_us, sent, self._name_of(interrupt)))

@@ -127,10 +127,7 @@ class TokenFrameSource:
     newest: ReceivedFrame | None = field(default=None, init=False)
 
     def latest(self) -> ReceivedFrame | None:
-        """Return the frame that the turn names; None before the first.
-
-        Raises Abandoned when it does not come.
-        """
+        """Return the turn's frame, None before the first; Abandoned when it does not come."""
         wanted = self.turns.frame
         if wanted == NO_FRAME:
             return None
@@ -139,10 +136,7 @@ class TokenFrameSource:
         return self.newest
 
     def wait(self, newer_than_sequence: int, timeout_s: float) -> ReceivedFrame | None:
-        """Wait for a frame that is not the one already seen; see `camera.FrameSource`.
-
-        Here the time-out counts in simulated time.
-        """
+        """Wait for a new frame, see `camera.FrameSource`, with a timeout in simulated time."""
         clock, arrived = self.clock, self.turns.frame_arrived
         deadline_us = clock.time_us() + int(timeout_s * US_PER_S)
         while True:

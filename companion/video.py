@@ -44,11 +44,7 @@ class Watcher(NamedTuple):
 def picture_of(frame: Frame | FurtherImage, range_m: float) -> NDArray[np.uint8]:
     """Return an image as a picture (h, w, 3) of even sides, at least `LEAST_PX` wide.
 
-    Depth is grey: near is bright, and what has no return is black.
-
-    Args:
-        frame: Of the camera; a whole frame shows the main one.
-        range_m: Farthest depth that the camera returns [m]; of a depth camera alone.
+    Depth up to `range_m` [m] is grey: near is bright, no return is black.
     """
     if frame.intrinsics.kind == "depth":
         shade = DARKEST + (255.0 - DARKEST) * nearness(frame.image, range_m)
@@ -79,18 +75,7 @@ class RtpVideo:
     """Encodes pictures as they come, and sends them to one address."""
 
     def __init__(self, host: str, port: int, size: tuple[int, int], rate_hz: float) -> None:
-        """Open a stream; nothing is sent yet.
-
-        Args:
-            host: Who watches.
-            port: UDP port; that after it gets RTCP.
-            size: Width and height of the pictures [px], even numbers.
-            rate_hz: Pictures a second, about: what the encoder divides its bits by.
-
-        Raises:
-            ImportError: PyAV is not installed.
-            OSError: The address cannot be sent to.
-        """
+        """Open a stream of pictures (width, height) to a UDP port; ImportError without PyAV."""
         import av
 
         self._av = av
@@ -107,10 +92,7 @@ class RtpVideo:
         self._last_pts = -1
 
     def show(self, picture: NDArray[np.uint8], time_us: int) -> None:
-        """Send a picture (h, w, 3) that was taken at a time [µs]; one that is older is left out.
-
-        Raises OSError when it cannot be sent.
-        """
+        """Send a picture (h, w, 3) of a time [µs] unless older than the last, or raise OSError."""
         if self._first_us is None:
             self._first_us = time_us
         pts = (time_us - self._first_us) * _CLOCK_HZ // US_PER_S

@@ -177,13 +177,7 @@ class CameraComponent:
     """Answers those who ask for the camera, from MAVSDK's own threads."""
 
     def __init__(self, mavsdk: Mavsdk, stream: Stream, clock: Clock) -> None:
-        """Be there from now on.
-
-        Args:
-            mavsdk: Connected as a component of type camera (`open_connection`).
-            stream: What is told.
-            clock: For the stamps.
-        """
+        """Announce a stream by a MAVSDK connected as a camera component (`open_connection`)."""
         self.running = True
         """Whether the video is wanted: clients may stop it, and start it again."""
         self._clock = clock
@@ -349,12 +343,12 @@ def show_video(
     stop: threading.Event,
     say: Callable[[str], None],
 ) -> int:
-    """Send what a camera sees until somebody stops it; return the number of pictures.
+    """Send a camera's video until `stop`; return the number of pictures.
 
     Args:
-        camera: Whose images are shown.
-        watcher: Who is sent the video.
-        network: Where ground stations are told of it; None: nobody is.
+        camera: The camera.
+        watcher: Receiver of the video.
+        network: Where to announce it to ground stations; None: nowhere.
         clock: For the stamps.
         stop: Set to end.
         say: Called with lines for the user.
@@ -405,10 +399,7 @@ def _send(
     stop: threading.Event,
     say: Callable[[str], None],
 ) -> int:
-    """Send frame after frame while they are wanted; return their number.
-
-    A radio link comes and goes: what cannot be sent is left out, which is said once.
-    """
+    """Send wanted frames; return their number. Network errors are reported once and skipped."""
     sent, seen, failing = 0, first, False
     while not stop.is_set():
         if wanted():

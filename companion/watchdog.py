@@ -54,10 +54,7 @@ class Watchdog:
         self._activity = activity
 
     def command(self, setpoint: Setpoint, hold_us: int) -> bool:
-        """Send a decided setpoint, meant to hold for so long [µs].
-
-        False when offboard has been left and it is too late.
-        """
+        """Send a setpoint with its hold [µs]; return False if offboard was left before."""
         with self._lock:
             if self.left_offboard:
                 return False

@@ -105,8 +105,7 @@ class Light:
     def sky(self) -> Floats:
         """Linear RGB irradiance (3,) of a level surface by the whole sky.
 
-        Two times the integral of (horizon + (zenith - horizon) x) x for x, the sine of the
-        elevation, from 0 to 1.
+        2 ∫ (horizon + (zenith - horizon) x) x dx over x, the sine of the elevation, 0 to 1.
         """
         return (self.horizon + 2.0 * self.zenith) / 3.0
 
@@ -128,15 +127,15 @@ def draw_appearance(
     wall_colour: Rgb,
     statics: Statics | None = None,
 ) -> Drawn:
-    """Draw the appearance of an arena. Same arguments, same appearance.
+    """Draw the appearance of an arena; deterministic.
 
     Args:
-        appearance: Knobs.
-        seed: Of the arena; runs of `appearance.period` seeds share what is drawn.
-        n_static: Number of primitives that stand still.
-        n_moving: Number of obstacles that move.
+        appearance: Settings.
+        seed: Seed of the arena; `appearance.period` consecutive seeds share their draws.
+        n_static: Number of static primitives.
+        n_moving: Number of moving obstacles.
         wall_colour: sRGB of the material `wall_colour`, 0-255.
-        statics: What those that stand are parts of; None: each is a thing of its own.
+        statics: Groups of static primitives; None = each on its own.
     """
     draw = seed // appearance.period
     kinds: list[tuple[_Part, Surfaces, int]] = [
@@ -182,8 +181,8 @@ def _surfaces(
 ) -> tuple[Floats, ...]:
     """Draw n surfaces of a kind: texture, albedos, size, offset, ..., in the order of `Finish`.
 
-    Everything is drawn whether or not it is used, and surface by surface: neither a knob nor the
-    number of surfaces changes the other draws. The parts of a thing of `statics` share its draws.
+    Everything is drawn surface by surface, used or not, so that settings and counts do not change
+    other draws. The parts of a group share its draws.
     """
     draws = rng.random((n, 7))
     materials = [appearance.material(name, wall_colour) for name in kind.materials]
@@ -279,8 +278,8 @@ def _drops(appearance: Appearance, draw: int) -> NDArray[np.float32]:
 def linear_of(encoded: Floats) -> Floats:
     """Return linear light of sRGB values, both 0..1 (IEC 61966-2-1).
 
-    The same to the bit on every processor, as what a seed draws must be: numpy's own power has
-    other last bits where there is AVX-512. So it is slow; for a picture's pixels make a table.
+    Bit-identical on every processor, as seeds require; numpy's power differs with AVX-512. Slow:
+    use a table for images.
     """
     raised = [x**2.4 for x in ((encoded + 0.055) / 1.055).ravel().tolist()]
     return np.where(encoded <= 0.04045, encoded / 12.92, np.reshape(raised, encoded.shape))

@@ -22,11 +22,7 @@ from airl_mav.profiles.mesh_file import MeshFile
 def generate_own(
     spec: ArenaSpec, seed: int, *, name: str, vehicle_width_m: float, zone: int | None
 ) -> Arena:
-    """Make the arena of a seed with the user's own generator; arguments as of `generate`.
-
-    Raises:
-        UsageError: There is no such generator, it raises, or what it makes cannot be flown in.
-    """
+    """Make a seed's arena with a custom generator, arguments as of `generate`; else UsageError."""
     make = plugins.load_part(plugins.GENERATORS, spec.generator)
     told = f"generator {spec.generator!r}, seed {seed}"
     try:
@@ -127,10 +123,7 @@ class _Thing:
 
 
 def draw_things(rng: np.random.Generator, n: int, spec: ArenaSpec) -> Things:
-    """Draw n things of the kinds of `spec.static.shapes`, the widest first.
-
-    As many numbers are drawn for an asset as for a shape: what one thing is changes no other.
-    """
+    """Draw n things of `spec.static.shapes`, widest first; assets take as many draws as shapes."""
     kinds = spec.static.shapes
     names = [kinds[i] for i in rng.integers(len(kinds), size=n).tolist()]
     numbers = rng.random(NUMBERS * n)

@@ -44,10 +44,7 @@ class Bodies:
 def draw_bodies(
     rng: np.random.Generator, n: int, kind: StaticObstacles, altitude_m: float
 ) -> Bodies:
-    """Draw n bodies of a kind, the widest first: big ones are harder to place later.
-
-    Every sphere crosses the height `altitude_m` above the floor [m].
-    """
+    """Draw n bodies, widest first because they are hardest to place; spheres cross `altitude_m`."""
     allowed = _shapes(kind.shapes)
     shape = allowed[rng.integers(len(allowed), size=n)]
     # Drawn here: numba needs longer to take a generator than numpy to draw all of them.
@@ -86,8 +83,7 @@ def _size(
 
     Args:
         numbers: (5 n,) uniform in [0, 1): n pairs of half widths, n heights, n headings, n offsets
-            of spheres from the flight altitude. Each becomes low + (high - low) number, which is
-            what `Generator.uniform` makes of it.
+            of spheres from the flight altitude, scaled as `Generator.uniform` does.
         shape: (n,).
         half_width_m: Range of half widths [m].
         height_m: Range of heights [m].
@@ -115,10 +111,7 @@ def _size(
 def _widest_first(
     shape: NDArray[np.int8], half_size: Floats, yaw: Floats, center_height: Floats, half: Floats
 ) -> None:
-    """Sort the fields of `Bodies` by their widest side, equal ones as they are.
-
-    By insertion: there are few, and numpy takes longer to begin with them.
-    """
+    """Sort the fields of `Bodies` stably by their widest side; insertion sort, as they are few."""
     for i in range(1, len(shape)):
         j = i
         while j > 0 and max(half[j, 0], half[j, 1]) > max(half[j - 1, 0], half[j - 1, 1]):

@@ -58,14 +58,14 @@ def draw_arena(
     goal_radius_m: float | None = None,
     zone_radii_m: Sequence[float] = (),
 ) -> None:
-    """Draw the arena as it is `time_us` after an episode's start.
+    """Draw the arena on axes, whose limits, aspect and labels are set.
 
     Args:
-        arena: What to draw.
-        ax: Where; its limits, aspect and labels are set, nothing else on it is touched.
-        time_us: Time since the start of the episode [µs]; moves the moving obstacles.
-        goal_radius_m: Radius of the disc that counts as the goal [m]; None draws none.
-        zone_radii_m: Radii of curriculum zones to draw [m].
+        arena: The arena.
+        ax: The axes.
+        time_us: Time since the start of the episode [µs].
+        goal_radius_m: Radius of the goal disc [m]; None = no disc.
+        zone_radii_m: Radii of curriculum zones [m].
     """
     _draw_floor(arena, ax)
     _draw_zones(arena, ax, zone_radii_m)

@@ -48,10 +48,7 @@ def with_room(boxes: Boxes, halves: Floats) -> Boxes:
 
 
 def bounding_half(shape: NDArray[np.int8], half_size: Floats, yaw: Floats) -> Floats:
-    """Return half extents (n, 2) [m] north and east of the footprints of n primitives.
-
-    Arguments are as the fields of `Obstacles`.
-    """
+    """Return half extents (n, 2) [m] north and east of primitives; arguments as in `Obstacles`."""
     half = np.empty((len(shape), 2))
     _bounding_half(shape, half_size, np.cos(yaw), np.sin(yaw), half)
     return half
@@ -103,10 +100,7 @@ def _segments_clear(
 
 @kernel
 def segment_clear(start: Floats, end: Floats, center: Floats, half: Floats) -> bool:
-    """Return whether the straight way from `start` (2,) to `end` (2,) touches no box.
-
-    Slab method: a segment meets a box when its stays between the box's two pairs of lines overlap.
-    """
+    """Return whether the segment from `start` (2,) to `end` (2,) touches no box (slab method)."""
     for j in range(len(center)):
         enter, leave = -math.inf, math.inf
         for axis in range(2):
@@ -131,10 +125,7 @@ def draw_numbers(rng: np.random.Generator, numbers: Floats) -> None:
 
 
 def inner(bounds: Bounds, margin: float | Floats) -> tuple[Floats, Floats]:
-    """Return the corners (2,), (2,) of the floor shrunk by `margin` [m] (a number, or (2,)).
-
-    The first exceeds the second when nothing is left.
-    """
+    """Return the corners of the floor shrunk by `margin` [m]; reversed when nothing is left."""
     low = np.array([bounds.north_min, bounds.east_min]) + margin
     high = np.array([bounds.north_max, bounds.east_max]) - margin
     return low, high

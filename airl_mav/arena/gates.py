@@ -38,10 +38,7 @@ class Openings:
 
 
 def draw_openings(rng: np.random.Generator, spec: ArenaSpec) -> Openings:
-    """Draw the openings of an arena's gates, uniform within the ranges of `spec.gates`.
-
-    Nothing is drawn again: every draw fits, as the profile has been checked.
-    """
+    """Draw the gates' openings, uniform within `spec.gates`, whose every value fits."""
     gates = spec.gates
     k = int(rng.integers(*gates.count, endpoint=True))
     numbers = rng.random((k, NUMBERS))
@@ -60,10 +57,7 @@ def draw_openings(rng: np.random.Generator, spec: ArenaSpec) -> Openings:
 
 
 def frames(openings: Openings, bounds: Bounds) -> Obstacles:
-    """Return the boxes of gates, PARTS of each one after the other.
-
-    They reach from the west wall of `bounds` to the east wall, and from the floor to their top.
-    """
+    """Return the boxes of gates, PARTS each, from west to east wall and floor to top."""
     k = len(openings)
     (north, east, down), (thick, wide, tall) = openings.center.T, openings.half_size.T
     west_edge, east_edge, bottom, top = east - wide, east + wide, -down - tall, -down + tall
@@ -88,13 +82,7 @@ def frames(openings: Openings, bounds: Bounds) -> Obstacles:
 
 
 def with_gates(statics: Statics | None, standing: Obstacles, k: int) -> Statics | None:
-    """Return what the primitives that stand belong to, with the boxes of k gates behind them.
-
-    Args:
-        statics: Of the others; None: each is a thing of its own.
-        standing: The others.
-        k: Number of gates.
-    """
+    """Return the groups of static primitives with k gates appended; None = single primitives."""
     if k == 0:
         return statics
     gates = Statics((GATE,) * k, np.repeat(np.arange(k), PARTS), (None,) * (PARTS * k))
@@ -102,13 +90,7 @@ def with_gates(statics: Statics | None, standing: Obstacles, k: int) -> Statics 
 
 
 def with_walls(statics: Statics | None, standing: Obstacles, walls: Statics) -> Statics:
-    """Return what the primitives that stand belong to, with those of walls behind them.
-
-    Args:
-        statics: Of the others; None: each is a thing of its own.
-        standing: The others.
-        walls: What the boxes of walls belong to.
-    """
+    """Return the groups of static primitives with those of walls appended."""
     if statics is None:
         names = tuple(Shape(int(shape)).name.lower() for shape in standing.shape)
         statics = Statics(names, np.arange(len(names)), (None,) * len(names))
@@ -133,10 +115,7 @@ def openings_of(arena: Arena) -> Openings:
 
 
 def over_openings(arena: Arena) -> NDArray[np.bool_]:
-    """Return (n_static,) which primitives that stand are below or above the opening of a gate.
-
-    Seen from above, they lie where the vehicle flies through.
-    """
+    """Return (n_static,) which static primitives lie above or below a gate's opening."""
     crossing: NDArray[np.bool_] = _part_of_gate(arena) >= 2
     return crossing
 

@@ -106,19 +106,19 @@ class _Request:
 def generate(
     spec: ArenaSpec, seed: int, *, name: str, vehicle_width_m: float, zone: int | None = None
 ) -> Arena:
-    """Make the arena of a seed. Same arguments, same arena, on any machine with this numpy.
+    """Make the arena of a seed, deterministic on any machine with this numpy.
 
-    The obstacles do not depend on the zone unless a first layout had no room for the goal.
+    The obstacles depend on the zone only if a first layout had no room for the goal.
 
     Args:
-        spec: Knobs.
-        seed: Not negative. Runs of `spec.count_period` seeds share the numbers of obstacles.
-        name: Goes into the arena and into messages.
-        vehicle_width_m: The way from start to goal is at least this wide [m].
-        zone: Curriculum zone that bounds the goal; None means the largest.
+        spec: Settings.
+        seed: Not negative; `spec.count_period` consecutive seeds share their obstacle counts.
+        name: Name for the arena and messages.
+        vehicle_width_m: Minimum width of the way from start to goal [m].
+        zone: Curriculum zone that bounds the goal; None = the largest.
 
     Raises:
-        UsageError: A wrong argument, or no such arena was found in LAYOUTS layouts: says why.
+        UsageError: Invalid argument, or no arena found in LAYOUTS layouts, with the reason.
     """
     if seed < 0:
         raise UsageError(f"seed = {seed}: accepted: value >= 0")
@@ -348,13 +348,7 @@ def _draw_reachable_goal(
 def _draw_moving(
     rng: np.random.Generator, request: _Request, standing: Boxes
 ) -> tuple[Obstacles, tuple[Tour, ...]]:
-    """Draw the moving obstacles where they are at time 0, and their tours.
-
-    Args:
-        rng: Source of the draws.
-        request: What is asked for.
-        standing: The bounding boxes of the static obstacles.
-    """
+    """Draw the moving obstacles at time 0, and their tours, around the static bounding boxes."""
     spec, (_, n) = request.spec, request.counts
     bodies = draw_bodies(rng, n, spec.moving, spec.flight_altitude_m)
     gap, walking_gap = spec.min_clearance_m, spec.moving.clearance_m

@@ -41,16 +41,15 @@ from airl_mav.profiles.mesh_file import MeshFile
 
 
 def indoors(look: Drawn, floor_m2: float, walls: tuple[tuple[int, float], ...]) -> Drawn:
-    """Return a look with the light of the sky from the ceiling, and no sun.
+    """Return a look with the sky's light from the ceiling and no sun.
 
-    The floor gets in the mean what a level surface outdoors gets of the sky, in luminance; colours
-    that walls and floor throw on each other come to that.
+    The mean luminance on the floor equals that of a level surface outdoors, interreflections of
+    walls and floor included.
 
     Args:
-        look: As it would be without a ceiling.
+        look: Look without a ceiling.
         floor_m2: Area of the floor [m²].
-        walls: Each surface that is a wall: its row in the `Finish`, and its area on all sides that
-            are seen [m²].
+        walls: Row in the `Finish` and visible area [m²] of each wall surface.
     """
     light, albedo = look.light, look.finish.albedo.mean(axis=1)
     areas = np.array([area for _, area in walls])
@@ -73,10 +72,7 @@ def indoors(look: Drawn, floor_m2: float, walls: tuple[tuple[int, float], ...]) 
 def _irradiances(
     floor_albedo: Floats, wall_albedo: Floats, floor_m2: float, walls_m2: float
 ) -> tuple[Floats, Floats]:
-    """Return the mean irradiance (3,) of floor and walls under a ceiling of radiosity 1.
-
-    The walls of a square room are 4 height / side of its floor.
-    """
+    """Return mean irradiance (3,) of floor and walls for a ceiling of radiosity 1."""
     across = seen_across(4.0 * floor_m2 / walls_m2)
     to_floor = (1.0 - across) * floor_m2 / walls_m2
     among = 1.0 - 2.0 * to_floor
@@ -90,12 +86,9 @@ def _irradiances(
 
 
 def seen_across(x: float) -> float:
-    """Return the view factor between two squares, one right above the other.
+    """Return the view factor between two squares, of side / distance `x`, one above the other.
 
     Howell and Menguc, A catalog of radiation heat transfer configuration factors, C-11.
-
-    Args:
-        x: Their side over their distance, above 0.
     """
     square, root = x * x, math.sqrt(1.0 + x * x)
     log = 0.5 * math.log((1.0 + square) ** 2 / (1.0 + 2.0 * square))

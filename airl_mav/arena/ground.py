@@ -86,10 +86,7 @@ class Ground:
 
     @cached_property
     def faces(self) -> NDArray[np.int32]:
-        """Triangles (m, 3) of numbers of `points` that rise above the floor, upper side front.
-
-        Seen from above their corners are clockwise, from north to east. The others are the floor's.
-        """
+        """Triangles (m, 3) of `points` above the floor, clockwise from above, north to east."""
         r, c = self.heights.shape
         first = (np.arange(r - 1)[:, None] * c + np.arange(c - 1)).ravel()
         north, east, both = first + c, first + 1, first + c + 1

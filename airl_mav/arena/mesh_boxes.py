@@ -78,14 +78,14 @@ class MeshBoxes:
 def boxes_of_mesh(
     path: Path, *, most: int = MOST_PARTS, scale: float = 1.0, up: Up = "auto"
 ) -> MeshBoxes:
-    """Return a mesh as an asset of boxes, with the finest cells that take no more boxes.
+    """Return a mesh as an asset of at most `most` boxes, with the finest possible cells.
 
-    The mesh is put with the middle of its footprint on the asset's place and its lowest point on
-    the floor; its x axis is the asset's forward axis.
+    The middle of the mesh's footprint is the asset's origin, its lowest point stands on the floor,
+    and its x axis points forward.
 
     Args:
         path: An STL, OBJ, GLB, glTF, PLY or OFF file.
-        most: Greatest number of boxes, 1 to `MOST_PARTS`.
+        most: Maximum number of boxes, 1 to `MOST_PARTS`.
         scale: Metres per unit of the file.
         up: Axis of the file that points up; "auto": y for GLB and glTF, else z.
 
@@ -146,10 +146,9 @@ def _finest(
 
 
 def joined(cells: Cells, most: int) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]] | None:
-    """Return boxes that are exactly the cells that are set, first and one past the last of each.
+    """Return boxes that are exactly the set cells, first and one past last; None above `most`.
 
-    Each begins at the first cell that no box has, and is the largest of those that grow along the
-    three axes one after the other, in any order. None: there would be more than `most`.
+    Each begins at the first free cell and is the largest that grows along the axes in any order.
     """
     left = cells.copy()
     boxes: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []
@@ -208,9 +207,8 @@ def _cells(
 ) -> tuple[Cells, NDArray[np.float64]]:
     """Return the cells (a, b, c) that a mesh fills, and the corner of the first (3,) [m].
 
-    `corners` (n, 3) are those of triangles with edges of at most e, `EDGE_SHARE` of a cell, no
-    point of which is further from a corner than e / sqrt(3). So the cells that the cubes around
-    all corners touch, which reach that far to each side, hold all of the surface.
+    `corners` (n, 3) belong to triangles with edges of at most e = `EDGE_SHARE` of a cell, so no
+    point is further than e / sqrt(3) from a corner; cubes of that reach cover the surface.
     """
     reach_m = EDGE_SHARE * cell_m / math.sqrt(3.0)
     first = corners.min(axis=0) - reach_m

@@ -42,8 +42,8 @@ def passage_exists(
 ) -> bool:
     """Return whether a disc `width_m` [m] wide can be moved from the origin to `goal` (2,) [m].
 
-    `boxes` has all obstacles in it, several of them in one where they are parts of one thing;
-    None: each is in a box of its own. `hills` are passed by at the side; None: there are none.
+    `boxes` bound all obstacles, with one box per group; None = one per obstacle. Hills are
+    bypassed.
     """
     if hills is not None and hills.ground.top_m <= hills.most_m:
         hills = None
@@ -55,11 +55,10 @@ def passage_exists(
 def gaps_suffice(
     bounds: Bounds, obstacles: Obstacles, goal: Floats, width_m: float, boxes: Boxes | None = None
 ) -> bool:
-    """Return whether every gap is wider than the vehicle; then every free place can be reached.
+    """Return whether all gaps are wider than the vehicle, so that every free place is reachable.
 
-    A rectangle's interior minus finitely many disjoint closed boxes is connected, and that is
-    what remains for the vehicle's centre when no two boxes grown by half its width touch. Arguments
-    as of `passage_exists`.
+    A rectangle's interior minus finitely many disjoint closed boxes is connected, and that is the
+    space of the vehicle's centre when no two boxes grown by half its width touch.
     """
     boxes = bounding_boxes(obstacles) if boxes is None else boxes
     low, high = inner(bounds, 0.0)
@@ -112,8 +111,8 @@ def raster_passage(
 ) -> bool:
     """Return whether free cells join the start's cell to the goal's, stepping along the axes.
 
-    A cell is free when its centre keeps half the width plus half a cell diagonal from everything:
-    no point of a step between two free cells, or of the last bit to the goal, is then too near.
+    A free cell's centre keeps half the width plus half a cell diagonal from everything, so that
+    steps between free cells are safe.
     """
     cell = _cell_m(bounds)
     margin = width_m / 2.0 + cell / math.sqrt(2.0)
@@ -139,10 +138,10 @@ def raster_passage(
 
 
 def _to_hills(hills: Hills, north: Floats, east: Floats, cell: float) -> Floats:
-    """Return how far (rows, columns) [m] cells surely are from ground that is in the way.
+    """Return the distance (rows, columns) [m] of cells from obstructing ground, a lower bound.
 
-    A point of such ground lies in a cell whose centre is hardly lower: by what it rises, at its
-    steepest, over half the cell's diagonal.
+    Points of the ground rise above their cell's centre by at most the steepest slope over half the
+    diagonal.
     """
     half_diagonal = cell / math.sqrt(2.0)
     low = hills.most_m - half_diagonal * float(hills.ground.relief.grid[STEEPEST])
@@ -154,10 +153,7 @@ def _to_hills(hills: Hills, north: Floats, east: Floats, cell: float) -> Floats:
 
 
 def free_share(bounds: Bounds, obstacles: Obstacles, count: int) -> float:
-    """Return the share of the floor that none of the first `count` obstacles covers, by a raster.
-
-    Of a pitch of 0.05 m at the finest, and CELLS_MAX cells.
-    """
+    """Return the free share of the floor among the first `count` obstacles, on a 0.05 m raster."""
     length, width = bounds.north_max - bounds.north_min, bounds.east_max - bounds.east_min
     cell = max(0.05, math.sqrt(length * width / CELLS_MAX))
     rows, columns = math.ceil(length / cell), math.ceil(width / cell)

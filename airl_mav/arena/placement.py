@@ -36,20 +36,17 @@ def draw_place(
     gap_m: float,
     place: Floats,
 ) -> bool:
-    """Draw a free place for one bounding box, uniform over all free ones.
+    """Draw a free place for a bounding box, uniform over all; return whether TRIES sufficed.
 
     Args:
-        rng: Source of the draws.
+        rng: Generator.
         half: (2,) half extents of the box [m].
         center: (k, 2) centres of the boxes that it must not overlap [m].
         taken: (k, 2) their half extents, any clearance already added [m].
         low: (2,) south-west corner of the floor [m].
         high: (2,) north-east corner of it [m].
-        gap_m: Least gap to the walls [m].
+        gap_m: Minimum gap to the walls [m].
         place: (2,) north, east [m]; written.
-
-    Returns:
-        Whether there was one within TRIES tries.
     """
     lowest = low + (half + gap_m)
     span, grown = high - (half + gap_m) - lowest, taken + half
@@ -70,8 +67,8 @@ def _first_free(
     """Write the first point of a rectangle that is in no box; return whether there is one.
 
     Args:
-        numbers: (k, 2) uniform in [0, 1): where in the rectangle the points are.
-        lowest: (2,) its south-west corner [m].
+        numbers: (k, 2) uniform in [0, 1): relative positions of the points.
+        lowest: (2,) south-west corner of the rectangle [m].
         span: (2,) its sides [m].
         center: (m, 2) centres of the boxes [m].
         grown: (m, 2) their half extents [m].
@@ -88,17 +85,12 @@ def _first_free(
 def place_all(
     rng: np.random.Generator, halves: Floats, keep_off: Boxes, bounds: Bounds, gap_m: float
 ) -> Floats:
-    """Draw places (n, 2) [m] for bounding boxes that keep `gap_m` from each other and the walls.
+    """Draw places (n, 2) [m] of bounding boxes (n, 2) `gap_m` apart from each other and the walls.
 
-    Args:
-        rng: Source of the draws.
-        halves: (n, 2) half extents [m].
-        keep_off: What else none may overlap; any clearance already added.
-        bounds: The walls.
-        gap_m: Least gap between two boxes, along north or along east, and to the walls [m].
+    `keep_off` are other boxes, any clearance already added.
 
     Raises:
-        NoRoomError: One found no place in TRIES tries; `progress` is how many had.
+        NoRoomError: One found no place in TRIES tries; `progress` is the number of placed boxes.
     """
     n, boxes = len(halves), with_room(keep_off, halves + gap_m)
     low, high = inner(bounds, 0.0)
@@ -133,17 +125,17 @@ def _place_all(
 
     Args:
         batches: (k, BATCH, 2) uniform in [0, 1), for one try of a box each.
-        halves: As of `place_all`, and so is `gap_m`.
-        center: Centres of what they must not overlap, and of themselves [m].
+        halves: As of `place_all`, as is `gap_m`.
+        center: Centres of the boxes to avoid, and of the placed ones [m].
         half: Half extents of these, any clearance already added [m].
-        low: As of `draw_place`, and so is `high`.
+        low: As of `draw_place`, as is `high`.
         high: See there.
         gap_m: See there.
-        placed: How many boxes have a place.
-        tried: How many batches the next one has been tried with.
+        placed: Number of placed boxes.
+        tried: Number of batches that the next one has tried.
 
     Returns:
-        `placed` and `tried` now, at most BATCHES, and how many of the batches were used.
+        New `placed` and `tried`, at most BATCHES, and the number of used batches.
     """
     n, used = len(halves), 0
     while placed < n and tried < BATCHES and used < len(batches):

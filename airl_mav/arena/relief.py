@@ -28,13 +28,7 @@ TRIES = 20
 
 
 def draw_ground(rng: np.random.Generator, terrain: Terrain, bounds: Bounds) -> Ground:
-    """Draw the ground of an arena; arguments as of `check_terrain`, which has passed them.
-
-    Args:
-        rng: Source of the draws.
-        terrain: Such that there are hills.
-        bounds: Of the floor.
-    """
+    """Draw the hills of an arena; arguments as of `check_terrain`, which has passed them."""
     least, greatest = terrain.relief_m
     relief_m = least + (greatest - least) * float(rng.random())
     length, width = bounds.north_max - bounds.north_min, bounds.east_max - bounds.east_min
@@ -68,17 +62,10 @@ def stand_on(
     statics: Statics | None,
     meshes: tuple[PlacedMesh, ...],
 ) -> tuple[Obstacles, tuple[PlacedMesh, ...]]:
-    """Return what stands on the floor, and its meshes, where it stands on the ground.
+    """Return obstacles and meshes moved from the floor onto the ground.
 
-    Each thing stands on the lowest ground around its place, out to the corners of its bounding box,
-    so that nothing floats. Spheres stay at their height, which is that above the start.
-
-    Args:
-        ground: Hills.
-        static: All primitives.
-        standing: The bounding boxes of the things.
-        statics: What the primitives are parts of; None: each is a thing of its own.
-        meshes: What cameras see of things.
+    Each thing stands on the lowest ground below its bounding box, so that nothing floats. Spheres
+    keep their height above the start.
     """
     if statics is None:
         kinds = tuple(Shape(int(shape)).name.lower() for shape in static.shape)
@@ -135,10 +122,7 @@ def _spline(at: Floats) -> tuple[NDArray[np.int64], tuple[Floats, Floats, Floats
 
 @kernel
 def plane_at(relief: Relief, north: float, east: float) -> tuple[float, float, float]:
-    """Return the height of the ground at a place [m], and its slopes to the north and to the east.
-
-    Beyond the grid, or where there are no hills, all are 0.
-    """
+    """Return the ground's height [m] and slopes to the north and east; 0 beyond the grid."""
     heights, grid = relief.heights, relief.grid
     if len(heights) == 0:
         return 0.0, 0.0, 0.0
@@ -170,20 +154,10 @@ def sample(relief: Relief, north: Floats, east: Floats, out: Floats) -> None:
 
 @large_kernel
 def extreme_within(relief: Relief, north: float, east: float, radius: float, sign: float) -> float:
-    """Return the greatest of `sign` times the height of the ground within a disc [m].
+    """Return the maximum of `sign` times the ground's height within a disc [m].
 
-    Exact: a triangle is flat, so its extremes in a disc are at its corners, where its edges cross
-    the disc's, or where it is steepest on the disc's edge.
-
-    Args:
-        relief: The ground.
-        north: Of the disc's middle [m].
-        east: The same.
-        radius: Of the disc [m].
-        sign: 1: the highest point; -1: the lowest, its height negative.
-
-    Returns:
-        Minus infinity where the disc is beyond the grid, or there are no hills.
+    Exact: a triangle's extremes in a disc are at its corners, where its edges cross the disc's, or
+    where it is steepest on the disc's edge. Minus infinity beyond the grid or without hills.
     """
     heights, grid = relief.heights, relief.grid
     best = -math.inf
@@ -246,19 +220,19 @@ def _in_middle(
     radius: float,
     best: float,
 ) -> float:
-    """Return the height of a triangle where it is greatest on the disc's edge, or `best`.
+    """Return a triangle's maximum height on the disc's edge, or `best`.
 
     Args:
-        s: From the disc's middle to the south-west corner of its cell [m].
+        s: Distance from the disc's middle to its cell's south-west corner, south [m].
         w: The same to the east.
         low: Height of that corner [m].
         up: Slope to the north.
         across: Slope to the east.
         step_n: Side of the cell to the north [m].
         step_e: Side to the east [m].
-        north_west: Which of the cell's triangles it is.
+        north_west: Which of the cell's triangles.
         radius: Of the disc [m].
-        best: Greatest height so far [m].
+        best: Maximum height so far [m].
     """
     steep = math.sqrt(up * up + across * across)
     x, y = 0.0, 0.0

@@ -96,14 +96,7 @@ class Plan:
 def draw_plan(
     rng: np.random.Generator, spec: ArenaSpec, bounds: Bounds, keep_off: Boxes, name: str
 ) -> Plan:
-    """Draw the rooms of an arena, none of whose walls is in `keep_off`.
-
-    Args:
-        rng: Source of the draws.
-        spec: Its knobs; there are rooms.
-        bounds: The walls of the arena, from the start.
-        keep_off: Where walls must not be: around the start, and a fixed goal.
-        name: What the arena is called in messages.
+    """Draw the rooms of an arena within bounds, without walls in `keep_off`.
 
     Raises:
         UsageError: No such plan was found.
@@ -153,10 +146,7 @@ def _divided(rng: np.random.Generator, rooms: Rooms, floor: Rect, count: int) ->
 def _cut(
     rng: np.random.Generator, rooms: Rooms, part: Rect, axis: int, n: int
 ) -> tuple[float, int]:
-    """Return where a part of the floor is cut [m], and how many of its n rooms are before that.
-
-    Both sides have room for theirs.
-    """
+    """Return where a part of the floor is cut [m], and how many of its n rooms lie before."""
     length, low = part.side(axis), part.low[axis]
     rows = rooms.slots(part.side(1 - axis))
     share = MIDDLE[0] + (MIDDLE[1] - MIDDLE[0]) * float(rng.random())
@@ -227,10 +217,9 @@ def _draw_doors(
     parts: tuple[Rect, ...],
     walls: tuple[tuple[int, Rect], ...],
 ) -> tuple[Door, ...]:
-    """Draw doors: those of a spanning tree of the rooms, and a share of the other neighbours.
+    """Draw doors of a random spanning tree (Kruskal) of the rooms and of some other neighbours.
 
-    The tree is that of Kruskal's algorithm with the pairs in random order; rooms on a corridor are
-    joined to it first.
+    Rooms on a corridor are joined to it first.
     """
     pairs = [pair for k in range(len(walls)) for pair in _neighbours(rooms, parts, walls, k)]
     order = [pairs[i] for i in rng.permutation(len(pairs)).tolist()]
@@ -266,10 +255,7 @@ _Pair = tuple[int, tuple[int, int], float, float]
 def _neighbours(
     rooms: Rooms, parts: tuple[Rect, ...], walls: tuple[tuple[int, Rect], ...], k: int
 ) -> list[_Pair]:
-    """Return the rooms on both sides of wall k that share enough of it for a door.
-
-    Of each pair: the wall, both rooms, and where they begin and end to share it [m].
-    """
+    """Return the pairs of rooms that share enough of wall k for a door: wall, rooms, range."""
     axis, wall = walls[k]
     along = 1 - axis
     before = [i for i, p in enumerate(parts) if _adjoins(p, wall, axis, p.high, wall.low)]
@@ -294,10 +280,7 @@ def _adjoins(
 
 
 def room_walls(plan: Plan, bounds: Bounds) -> tuple[Obstacles, Statics]:
-    """Return the boxes of the walls of a plan, and what they are parts of.
-
-    Every wall is one thing, with the lintels above its doors. A door as high as the walls has none.
-    """
+    """Return the boxes of a plan's walls, grouped by wall with the lintels above lower doors."""
     parts: list[tuple[int, Rect, float]] = []
     for k, (axis, wall) in enumerate(plan.walls):
         along, here = 1 - axis, wall.low[1 - axis]

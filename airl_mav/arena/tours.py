@@ -43,19 +43,16 @@ def draw_tours(
     gap_m: float,
     kind: MovingObstacles,
 ) -> list[Tour]:
-    """Draw the tours of n obstacles, which begin where they are at time 0, clear of each other.
+    """Draw closed tours, clear of each other at time 0; fewer where one finds no place.
 
     Args:
-        rng: Source of the draws.
+        rng: Generator.
         halves: (n, 2) half extents of their bounding boxes [m].
-        keep_off: What they are clear of at time 0, any clearance already added.
-        walls: What they are clear of on their way, likewise.
+        keep_off: Boxes to avoid at time 0, any clearance already added.
+        walls: Boxes to avoid on the way, likewise.
         bounds: The walls of the room.
-        gap_m: Least gap between two of them at time 0 [m].
-        kind: Speed range, leg length, dwell, least duration, clearance on the way.
-
-    Returns:
-        Closed tours; fewer than n when one found no place, or no way to leave it.
+        gap_m: Minimum gap between two of them at time 0 [m].
+        kind: Speed range, leg length, dwell, minimum duration, clearance on the way.
     """
     boxes = with_room(keep_off, halves + gap_m)
     low, high = inner(bounds, 0.0)
@@ -105,9 +102,9 @@ def _walk_all(
     dwell_s: float,
     least_s: float,
 ) -> tuple[Floats, NDArray[np.int64], Floats]:
-    """Return the way-points (k, 2) of all walks, how many each has (m,), and the speeds (m,).
+    """Return the way-points (k, 2) of all walks, the count of each (m,), and the speeds (m,).
 
-    Arguments as of `draw_tours`; the starts are written into the last rows of `center`.
+    The starts are written into the last rows of `center`.
     """
     n = len(halves)
     points, counts, speeds = np.empty((0, 2)), np.zeros(n, np.int64), np.empty(n)
@@ -152,10 +149,7 @@ def _walk(
     dwell_s: float,
     least_s: float,
 ) -> Floats:
-    """Return the way-points (k, 2) of a closed walk; of one that cannot leave `start`, that alone.
-
-    Its centre never enters the boxes, and stays between the corners [m].
-    """
+    """Return the way-points (k, 2) of a closed walk clear of the boxes, or `start` alone."""
     points = np.empty((64, 2))
     points[0] = start
     count, elapsed, homing = 1, 0.0, 0
@@ -180,11 +174,7 @@ def _walk(
 
 
 def set_out_later(arena: Arena, later_s: float) -> Arena:
-    """Return the arena whose moving obstacles are so much later [s] where they are in this one.
-
-    At `later_s` they stand where this one has them at time 0, and walk on as they do there; before
-    that they walk the ends of their tours, which are closed.
-    """
+    """Return the arena with its moving obstacles delayed by `later_s` on their closed tours."""
     if not arena.tours or later_s == 0.0:
         return arena
     tours = tuple(_begun_at(tour, -later_s % float(tour.times_s[-1])) for tour in arena.tours)
@@ -235,17 +225,14 @@ def _draw_waypoint(
 def _timed(
     points: Floats, counts: NDArray[np.int64], speeds: Floats, legs: Floats, dwell_s: float
 ) -> tuple[Floats, Floats, NDArray[np.int64]]:
-    """Time the tours at constant speeds, with a stop at each point but the first.
+    """Return times [s] and places [m] of tours at constant speeds, and where each ends.
 
     Args:
         points: (k, 2) way-points of all tours, one tour after the other [m].
-        counts: (m,) how many each has.
+        counts: (m,) number of each.
         speeds: (m,) of each [m/s].
-        legs: (k - 1,) length of the way from each point to the next [m].
-        dwell_s: How long a stop lasts; 0: there is none.
-
-    Returns:
-        Times [s] and places [m] of all tours, and where in them each ends.
+        legs: (k - 1,) distance from each point to the next [m].
+        dwell_s: Duration of a stop at each point but the first.
     """
     stops = 1 if dwell_s > 0.0 else 0
     times, places = np.empty(len(points) * (1 + stops)), np.empty((len(points) * (1 + stops), 2))

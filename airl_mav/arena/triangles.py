@@ -47,21 +47,12 @@ class Triangles:
 
 @lru_cache(maxsize=KEPT)
 def triangles_of(file: MeshFile) -> Triangles:
-    """Return the triangles of a file, read once in a process.
-
-    Raises:
-        UsageError: It cannot be read, is not the file that the profile was made with, or holds
-            anything but triangles.
-    """
+    """Return the triangles of a file, cached; UsageError if it is missing or changed."""
     return decoded(read_checked(file), file.file)
 
 
 def standing(placed: PlacedMesh) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    """Return the vertices (n, 3) NED [m] of a mesh where it stands, and its faces (m, 3).
-
-    Raises:
-        UsageError: As `triangles_of`.
-    """
+    """Return vertices (n, 3) NED [m] and faces (m, 3) of a mesh; raises as `triangles_of`."""
     held = triangles_of(placed.file)
     cos, sin = math.cos(placed.yaw), math.sin(placed.yaw)
     turn = placed.scale * np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
@@ -70,11 +61,7 @@ def standing(placed: PlacedMesh) -> tuple[NDArray[np.float64], NDArray[np.int32]
 
 
 def drawn(meshes: Iterable[PlacedMesh], most: int = MOST_DRAWN) -> list[PlacedMesh]:
-    """Return the meshes, of so many triangles at most, that a scene for people shows as they are.
-
-    The others are shown as boxes. Those are too much for a browser, or their file is not there:
-    pictures of old flights are looked at without it.
-    """
+    """Return the meshes that scenes draw; large or missing ones are drawn as boxes instead."""
     shown: list[PlacedMesh] = []
     left = most
     for each in meshes:
@@ -96,11 +83,7 @@ def encoded(triangles: Triangles) -> bytes:
 
 
 def decoded(data: bytes, source: str) -> Triangles:
-    """Return the triangles that a file holds; `source` is what messages call it.
-
-    Raises:
-        UsageError: It holds anything but triangles of an asset.
-    """
+    """Return the triangles in a file's data, or UsageError naming `source`."""
     try:
         with np.load(io.BytesIO(data), allow_pickle=False) as archive:
             vertices, faces = archive["vertices"], archive["faces"]

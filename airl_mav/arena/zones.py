@@ -15,10 +15,7 @@ from airl_mav.profiles.arena import ArenaSpec
 
 
 def zone_radius_m(spec: ArenaSpec, zone: int | None) -> float:
-    """Return how far [m] from the start a goal of a zone may be; None means the largest zone.
-
-    Raises FieldError when there is no such zone.
-    """
+    """Return the maximum goal distance [m] of a zone, None = the largest; FieldError if missing."""
     if zone is None:
         return spec.zones_m[-1]
     if not 0 <= zone < len(spec.zones_m):
@@ -42,18 +39,7 @@ def draw_goal(
     ring_m: tuple[float, float],
     gap_m: float,
 ) -> Floats | None:
-    """Draw a goal (2,) [m], uniform over the free floor at a distance within `ring_m`.
-
-    Args:
-        rng: Source of the draws.
-        bounds: The walls.
-        keep_off: Where it must not be; any clearance already added.
-        ring_m: Least and greatest distance from the start [m].
-        gap_m: Least gap to the walls [m].
-
-    Returns:
-        North, east from the start; None when no try was free.
-    """
+    """Draw a goal (2,) [m] on the free floor at a distance `ring_m`; None if none is found."""
     nearest, farthest = ring_m
     low, high = inner(bounds, gap_m)
     low, high = np.maximum(low, -farthest), np.minimum(high, farthest)
@@ -79,10 +65,7 @@ def _find_goal(
     half: Floats,
     goal: Floats,
 ) -> bool:
-    """Write the first point within the ring, outside all boxes.
-
-    Of those that `numbers` (n, 2), uniform in [0, 1), stand for.
-    """
+    """Write the first of the points `numbers` (n, 2), scaled, in the ring and outside all boxes."""
     for number in numbers:
         for axis in range(2):
             goal[axis] = low[axis] + span[axis] * number[axis]

@@ -54,10 +54,7 @@ class Bvh(NamedTuple):
 
 
 def build_bvh(triangles: Triangles) -> Bvh:
-    """Return the tree over triangles: a pure function of them.
-
-    Triangles without an area are left out: no ray hits them.
-    """
+    """Return the tree over triangles with an area; deterministic."""
     corners = triangles.corners.astype(np.float64)
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(across, axis=1)
@@ -95,7 +92,7 @@ def _build(
     Args:
         low: (m, 3) lowest corners of the boxes.
         high: (m, 3) highest.
-        order: (m,) their numbers, changed into the order of the leaves.
+        order: (m,) their numbers, sorted by leaf.
         bounds: (2 m - 1, 6) written: lowest and highest corner of each node.
         links: (2 m - 1, 2) written, as of `Bvh`.
     """
@@ -155,16 +152,9 @@ def _best_split(
     from_low: NDArray[np.float64],
     from_high: NDArray[np.float64],
 ) -> tuple[int, int]:
-    """Return the axis, and the last bin on the left, of the split of least cost; -1: there is none.
+    """Return axis and last left bin of the cheapest split of boxes begin..end; -1 = none.
 
-    Args:
-        low: As of `_build`, with the next two.
-        high: Highest corners.
-        order: Numbers of the boxes.
-        begin: First of the boxes that are split.
-        end: One after the last.
-        from_low: (3,) twice the least of their centres.
-        from_high: (3,) twice the greatest.
+    `from_low` and `from_high` (3,) are twice the extremes of their centres.
     """
     filled = np.empty(BINS, np.int64)
     bin_low, bin_high = np.empty((BINS, 3)), np.empty((BINS, 3))
@@ -225,10 +215,9 @@ def bvh_of(file: MeshFile) -> Bvh:
 
 @lru_cache(maxsize=KEPT)
 def ground_tree(ground: Ground) -> Bvh:
-    """Return the tree of the triangles of ground.
+    """Return the tree of the ground's triangles along east, south and down (`GROUND_POSE`).
 
-    Their axes are east, south and down from the start: `GROUND_POSE` turns them. So the floor's
-    pattern goes on over the hills, which begins along these (`surfaces.shade_floor`).
+    The floor's pattern begins along these axes and continues on hills (`surfaces.shade_floor`).
     """
     corners = ground.points[:, [1, 0, 2]] * (1.0, -1.0, 1.0)
     return build_bvh(Triangles(corners.astype(np.float32), ground.faces))
@@ -254,10 +243,7 @@ NO_TREES: Final = Forest(
 
 @lru_cache(maxsize=4)
 def forest_of(files: tuple[MeshFile, ...], ground: Ground | None = None) -> Forest:
-    """Return the trees of meshes, and of the ground, in one.
-
-    Raises UsageError as `triangles_of`.
-    """
+    """Return the joint trees of meshes and ground; raises as `triangles_of`."""
     names: list[MeshFile | None] = [*files]
     trees = [bvh_of(file) for file in files]
     if ground is not None:
@@ -345,17 +331,16 @@ def meshes_of(
     ground: Ground | None = None,
     clear: NDArray[np.bool_] | None = None,
 ) -> Meshes | None:
-    """Return the meshes of an arena, hills among them; None: it has none, and no glass.
+    """Return an arena's meshes, hills included; None without meshes, hills and glass.
 
     Args:
         placed: The meshes.
         n_obstacles: Obstacles of the arena.
         ground: Its hills.
-        clear: (n,) obstacles that depth passes through, `Arena.clear`; None: it passes none, or
-            these are for a colour camera.
+        clear: (n,) obstacles that depth passes through, `Arena.clear`; None = none, as for colour.
 
     Raises:
-        UsageError: The file of one cannot be read, or is another one.
+        UsageError: A file is missing or has changed.
     """
     if not placed and ground is None and clear is None:
         return None
@@ -370,9 +355,9 @@ def placed_in(
     n_obstacles: int,
     clear: NDArray[np.bool_] | None = None,
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32], NDArray[np.float64]]:
-    """Return `owner`, `first`, `root` and `pose` of `Meshes`; hills where `roots` has them.
+    """Return `owner`, `first`, `root` and `pose` of `Meshes`, with hills if in `roots`.
 
-    `clear` as of `meshes_of`. A mesh of glass stays what it is: depth ends on it.
+    `clear` as of `meshes_of`; depth ends on meshes of glass.
     """
     owner = np.full(n_obstacles, -1, np.int32)
     if clear is not None:

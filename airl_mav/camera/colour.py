@@ -108,37 +108,16 @@ def render_colour(
     atlas: Plane,
     bent: Bent | None,
 ) -> None:
-    """Render the colour image of an arena.
+    """Render the colour image of an arena; arguments not listed as of `render_depth`.
 
-    Args:
-        rgb: (height, width, 3) sRGB, written; black from inside an obstacle.
-        depth: (height, width) depth [m] as `render_depth` defines it, without a limit of range,
-            written; 0: no surface.
-        seen: (height, width) what each pixel sees, written: CEILING, SKY, ... of `primitives`, for
-            an obstacle OBSTACLE + its number, for a mesh that of the first obstacle it owns, for
-            hills FLOOR.
-        work: For this size of image.
-        position: As of `render_depth`, with the rest up to `meshes`.
-        quaternion: (4,).
-        focal: Focal length.
-        cx: Column of the optical axis.
-        cy: Row of the optical axis.
-        cylindrical: The image is a cylinder's.
-        bounds: (6,).
-        shape: (n,).
-        center: (n, 3).
-        half_size: (n, 3).
-        yaw: (n,).
-        meshes: Those that are seen; None: there are none.
-        texture: (2 + n,) `Finish.texture`.
-        per_m: (2 + n,) periods of the pattern for a metre.
-        offset: (2 + n, 2) `Finish.offset`.
-        albedo: (2 + n, 2, 3) `Finish.albedo`.
-        gloss: What surfaces are beside matt; None: all are, and nothing is spent on it.
-        lights: (7, 3) direction of the sun, its irradiance, that of the sky, the floor's mean
-            radiosity, zenith, horizon; then the fog's extinction [1/m] in the first column.
-        atlas: `textures.atlas()`.
-        bent: As of `render_depth`.
+    `rgb` (height, width, 3) sRGB, `depth` (height, width) unlimited [m], 0 = no surface, and `seen`
+    are written; the image is black from inside an obstacle. `seen` is CEILING, SKY, ... of
+    `primitives`, FLOOR also for hills, OBSTACLE + the number of an obstacle or of a mesh's first.
+    `texture` (2 + n,), `offset` (2 + n, 2) and `albedo` (2 + n, 2, 3) are those of `Finish`,
+    `per_m` (2 + n,) periods of the pattern per metre, `atlas` is `textures.atlas()`. `gloss`
+    describes surfaces that are not matt; None costs nothing. `lights` (7, 3): direction of the sun,
+    its irradiance, that of the sky, the floor's mean radiosity, zenith, horizon, and the fog's
+    extinction [1/m] in the first column.
     """
     camera = raised(meshes, position)
     lines, xs = work.lines, work.xs
@@ -204,32 +183,11 @@ def _show(
     lights: NDArray[np.float32],
     atlas: Plane,
 ) -> None:
-    """Write the colours of what `draw_bodies` has drawn.
+    """Write the colours of what `draw_bodies` has drawn; arguments as of `render_colour`.
 
-    Args:
-        rgb: As of `render_colour`.
-        far: (n, m) depth [m]; 0: no surface.
-        ids: (n, m) what each pixel sees; hills become the floor here.
-        rectangles: (obstacles + meshes, 3, 4) that each body was drawn in.
-        faces: (n, m) where a mesh is seen, which of its triangles; None: there are no meshes.
-        work: Its lines and their rays as `aim` wrote them.
-        bent: As of `render_colour`.
-        view: How the image sees.
-        axes: The camera's axes.
-        camera: (3,) NED [m], above the ground.
-        bounds: As of `render_colour`, with the rest.
-        shape: (n,).
-        center: (n, 3).
-        half_size: (n, 3).
-        yaw: (n,).
-        meshes: Those that are seen.
-        texture: (2 + n,).
-        per_m: (2 + n,).
-        offset: (2 + n, 2).
-        albedo: (2 + n, 2, 3).
-        gloss: As of `render_colour`.
-        lights: (7, 3).
-        atlas: Of all textures.
+    `far` (n, m) is depth [m], `ids` what each pixel sees (hills become floor), `rectangles`
+    (obstacles + meshes, 3, 4) where bodies were drawn, `faces` (n, m) the meshes' triangles,
+    `camera` (3,) NED [m] above the ground.
     """
     lines, xs = work.lines, work.xs
     light = _lit(lights)

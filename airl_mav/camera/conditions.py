@@ -20,15 +20,7 @@ def check_noise(
     table: str = "sensors",
     further: Iterable[Camera] = (),
 ) -> None:
-    """Raise FieldError for what makes depths worse, where no camera gives any.
-
-    Args:
-        camera: The main camera, which faults happen to.
-        asked: Conditions that its images are taken in.
-        faults: What shall fail.
-        table: What `asked` is called.
-        further: The vehicle's others.
-    """
+    """Raise FieldError for depth noise or faults without any depth camera."""
     if camera.kind == "depth":
         return
     measured = any(each.kind == "depth" for each in further)
@@ -44,14 +36,7 @@ def check_noise(
 def check_renderer(
     camera: Camera, renderer: Renderer, arena: ArenaSpec, further: Iterable[Camera] = ()
 ) -> None:
-    """Raise FieldError for what a renderer does not draw.
-
-    Args:
-        camera: The main camera.
-        renderer: What draws.
-        arena: Where it looks.
-        further: The vehicle's others.
-    """
+    """Raise FieldError for cameras or arenas that a renderer does not support."""
     if renderer == "raycast":
         return
     for each in (camera, *further):
@@ -73,10 +58,7 @@ def _check_drawn(camera: Camera, renderer: Renderer, arena: ArenaSpec) -> None:
 
 
 def check_twin_imaging(camera: Camera, name: str = "") -> None:
-    """Raise FieldError for a gain that takes time, where only decisions take frames.
-
-    `name` is that of a further camera.
-    """
+    """Raise FieldError for auto-exposure lag, where only decisions take frames."""
     auto = None if camera.imaging is None else camera.imaging.auto_exposure
     if auto is not None and auto.time_constant_s > 0.0:
         raise FieldError(

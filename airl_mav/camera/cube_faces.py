@@ -66,11 +66,10 @@ def side_for(camera: Intrinsics, samples: int) -> int:
 
 
 def cube_of(camera: Intrinsics, side: int) -> Cube:
-    """Return the faces that a camera's image is made of, with side x side places a pixel.
+    """Return the cube faces of a camera's image with side x side samples per pixel.
 
-    A face is in its middle, where it is coarsest, as fine as the image so divided is outwards from
-    its own middle, where that is finest. Around its middle a fisheye's image is finer, by half at
-    90 degrees.
+    The middle of a face, where it is coarsest, is as fine as the image's middle so divided. Around
+    it a fisheye's image is finer, by half at 90 degrees.
     """
     k, fine = camera, finer(camera, side)
     rays = rays_of(fine)
@@ -90,10 +89,7 @@ def cube_of(camera: Intrinsics, side: int) -> Cube:
 
 
 def resampled(cube: Cube, images: list[Floats]) -> Floats:
-    """Return the image (h, w, channels) of the rendered parts (height, width, channels) of faces.
-
-    Each pixel is the mean of its places that see anything, in the order of `Cube.faces`; 0: none.
-    """
+    """Return the image (h, w, channels) of faces: the mean of each pixel's samples; 0: none."""
     height, width = cube.shape
     side, channels = cube.side, images[0].shape[-1] if images else 3
     light = np.zeros((height * side * width * side, channels))

@@ -18,10 +18,7 @@ from airl_mav.profiles.distortion import distorted, sees_to, undistorted
 
 
 def fisheye_rays(camera: Intrinsics) -> NDArray[np.float64]:
-    """Return the unit rays (3, h, w) of a fisheye's pixels: forward, right, down.
-
-    They are 0 where a pixel lies outside of the lens's circle, and sees nothing.
-    """
+    """Return unit rays (3, h, w) forward, right, down of a fisheye; 0 outside the circle."""
     across = (np.arange(camera.width) - camera.cx) / camera.focal
     down = ((np.arange(camera.height) - camera.cy) / camera.focal)[:, None]
     out = np.hypot(across, down)
@@ -36,10 +33,7 @@ def fisheye_rays(camera: Intrinsics) -> NDArray[np.float64]:
 
 
 def fisheye_places(camera: Intrinsics, points: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return the columns and rows on which points (3, ...) fall: forward, right, down.
-
-    What is outside of the lens's circle falls on infinity.
-    """
+    """Return columns and rows of points (3, ...); infinity outside the circle."""
     aside = np.hypot(points[1], points[2])
     off = np.arctan2(aside, points[0])
     scale = camera.focal * distorted(off, camera.distortion) / np.maximum(aside, 1e-9)

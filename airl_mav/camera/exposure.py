@@ -79,13 +79,13 @@ def expose(
     position: Vec | NDArray[np.float64],
     quaternion: Quat | NDArray[np.float64],
 ) -> NDArray[Any]:
-    """Return the image of an arena that a camera takes, as `Frame.image` holds it.
+    """Return the image that a camera takes of an arena, as in `Frame.image`.
 
     Args:
-        arena: What is seen.
-        centers: (n, 3) present obstacle centres NED [m], as `Arena.centers_at` gives them.
+        arena: The arena.
+        centers: (n, 3) present obstacle centres NED [m], as of `Arena.centers_at`.
         intrinsics: The camera.
-        max_range: Greatest depth that gives a return [m]; colour has no limit.
+        max_range: Maximum depth [m]; unlimited for colour.
         position: (3,) camera NED [m].
         quaternion: (4,) unit [w, x, y, z] camera -> NED; its x axis is the optical axis.
     """

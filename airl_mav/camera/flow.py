@@ -66,16 +66,9 @@ def velocities_of(arena: Arena, elapsed_us: int) -> Floats:
 def optical_flow(
     picture: Picture, camera: Intrinsics, motion: CameraMotion, velocities: Floats
 ) -> NDArray[np.float32]:
-    """Return how fast what each pixel shows moves over the image.
+    """Return the flow (h, w, 2) of a picture [px/s]; NaN where a fisheye sees nothing.
 
-    Args:
-        picture: What the camera sees.
-        camera: Its intrinsics.
-        motion: How it moves.
-        velocities: (n, 3) of the obstacles NED [m/s].
-
-    Returns:
-        (h, w, 2) columns and rows a second [px/s]; NaN in a fisheye's pixels that see nothing.
+    `velocities` (n, 3) are those of the obstacles NED [m/s].
     """
     rays = rays_of(camera)
     axes = quat_to_matrix(motion.quaternion)

@@ -179,11 +179,10 @@ class Frame:
     def from_bytes(cls, data: bytes) -> Frame:
         """Read the wire form.
 
-        Raises FrameError for anything else, also for what no camera takes: an image without pixels
-        or with too many, a focal length or a centre out of bounds, or not a number, a cylinder of
-        more than a turn, coefficients out of bounds, a damaged JPEG or one of another size; of
-        several cameras also images of different moments, or two of one name. Raises UsageError for
-        a JPEG where Pillow is not installed.
+        Raises:
+            FrameError: Not a frame, values out of bounds, a damaged or misfit JPEG, or images of
+                different moments or equal names.
+            UsageError: A JPEG without Pillow.
         """
         if data[: len(RIG_MAGIC)] == RIG_MAGIC:
             return _of_several(cls, data)
@@ -286,9 +285,9 @@ def rgb_of(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def nearness(depth_mm: NDArray[Any], range_m: float) -> NDArray[np.float64]:
-    """Return how near a depth image [mm] is, for pictures: 1 at the camera, 0 at a range [m].
+    """Return the nearness of depth [mm]: 1 at the camera or without return, 0 at a range [m].
 
-    By the square root, which shows near things best. What has no return is as the camera itself.
+    A square root, which shows near things best.
     """
     near: NDArray[np.float64] = 1.0 - np.sqrt(np.clip(depth_mm / (MM_PER_M * range_m), 0.0, 1.0))
     return near

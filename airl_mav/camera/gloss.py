@@ -67,10 +67,7 @@ def let_through(gloss: Gloss | None, row: int) -> np.float32:
 
 @kernel
 def fresnel(cosine: float) -> float:
-    """Return the share of unpolarised light that is reflected where it enters varnish or glass.
-
-    `cosine`: of the angle between ray and normal, 0 to 1.
-    """
+    """Return the reflected share of unpolarised light by the cosine of ray and normal, 0 to 1."""
     inner = math.sqrt(1.0 - (1.0 - cosine * cosine) / (INDEX * INDEX))
     across = (cosine - INDEX * inner) / (cosine + INDEX * inner)
     along = (INDEX * cosine - inner) / (INDEX * cosine + inner)
@@ -99,17 +96,10 @@ def _visible(alpha: float, cosine: float) -> float:
 
 @kernel
 def highlight(alpha: float, normal: Vec, ray: Vec, to_sun: Vec) -> tuple[float, float]:
-    """Return what a rough surface reflects of the sun, for a white facet.
+    """Return radiance per irradiance of the sun on a rough white surface, and the facets' cosine.
 
-    Args:
-        alpha: Width of the slopes.
-        normal: (3,) unit vector on the side that is seen.
-        ray: (3,) unit vector of the ray that meets it.
-        to_sun: (3,) unit vector.
-
-    Returns:
-        Radiance over irradiance, both in the units of `Lit`; and the cosine at the facets, by which
-        Fresnel's share of it is known.
+    `alpha` is the width of the slopes; the vectors are unit vectors. The cosine gives Fresnel's
+    share.
     """
     sun, eye = dot(normal, to_sun), -dot(normal, ray)
     if sun <= 0.0 or eye <= 0.0:
@@ -146,10 +136,7 @@ def spread(number: int) -> tuple[float, float]:
 
 @kernel
 def facet(alpha: float, normal: Vec, ray: Vec, u: float, v: float) -> Vec:
-    """Return the normal of one of the facets that are seen at a point.
-
-    As many are seen in each direction as (u, v) lie evenly in the unit square.
-    """
+    """Return the normal of a visible facet; even (u, v) in the unit square give their density."""
     # Axes about the normal (Duff et al., Building an orthonormal basis, revisited, 2017).
     sign = math.copysign(1.0, normal[2])
     a = -1.0 / (sign + normal[2])

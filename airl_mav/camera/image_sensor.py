@@ -31,11 +31,11 @@ def codes_of(light: Light) -> NDArray[np.uint8]:
 
 
 def vignette(camera: Intrinsics, share: float) -> Light:
-    """Return what share of the light (h, w) a lens lets through.
+    """Return a lens's transmission (h, w).
 
-    1 - share (r / R)² at a distance r from the optical axis, of which R is that of the farthest
-    pixel: the first term of the even polynomials that lenses are calibrated with (Goldman, Chen,
-    "Vignette and exposure calibration and compensation", ICCV 2005).
+    1 - share (r / R)² at a distance r from the optical axis, R that of the farthest pixel: the
+    first term of the even polynomials that lenses are calibrated with (Goldman, Chen, "Vignette and
+    exposure calibration and compensation", ICCV 2005).
     """
     across = np.arange(camera.width) - camera.cx
     down = np.arange(camera.height) - camera.cy
@@ -47,18 +47,18 @@ def vignette(camera: Intrinsics, share: float) -> Light:
 def noisy(
     light: Light, gain: float, full_well_e: float, read_noise_e: float, rng: np.random.Generator
 ) -> Light:
-    """Return light as a sensor measures it that counts photons.
+    """Return light as a photon-counting sensor measures it.
 
     A pixel that reads x holds N = x full_well_e / max(gain, 1) electrons: a gain above 1 multiplies
     what was counted, one below 1 is a darker exposure. Their number has the variance N (Poisson's,
     in its normal approximation), reading it adds read_noise_e² (EMVA 1288, release 4.0, section 2).
 
     Args:
-        light: (...) what it would be without noise, after the gain; beyond 1 the sensor is full.
+        light: (...) without noise, after the gain; above 1 the sensor is full.
         gain: Of the light.
         full_well_e: Electrons of a white pixel at a gain of 1.
         read_noise_e: Standard deviation of reading [electrons].
-        rng: What draws.
+        rng: Generator.
     """
     full = np.minimum(light, np.float32(1.0))
     per_light = full_well_e / max(gain, 1.0)
@@ -77,11 +77,7 @@ def mosaic(light: Light) -> Light:
 
 
 def demosaiced(raw: Light) -> Light:
-    """Return RGB light (h, w, 3) of a mosaic (h, w): a colour that is not measured is interpolated.
-
-    It is the mean of its nearest neighbours that measure it, two or four: bilinear interpolation.
-    At the edges it is the mean of those that there are.
-    """
+    """Return RGB light (h, w, 3) of a mosaic (h, w) by bilinear interpolation."""
     height, width = raw.shape
     red, blue = np.zeros_like(raw), np.zeros_like(raw)
     red[::2, ::2] = blue[1::2, 1::2] = 1.0

@@ -59,10 +59,7 @@ class ImageFormation:
     """Takes the images of one camera with a table `imaging`; its gain may follow the light."""
 
     def __init__(self, camera: Camera, name: str = "") -> None:
-        """Take a camera of kind rgb or grey; without the table all of it is off.
-
-        `name` is that of a further camera, whose noise is drawn apart.
-        """
+        """Prepare a camera of kind rgb or grey; `name` seeds an additional camera's noise."""
         self._own = words_of(name)
         self._imaging = camera.imaging or Imaging()
         self._camera = Intrinsics.of(camera)
@@ -82,16 +79,15 @@ class ImageFormation:
         """Return an image.
 
         Args:
-            arena: What is seen.
-            elapsed_us: Time since the episode's start, at the middle of the exposure [µs]; with a
-                rolling shutter, of that of the middle row.
-            motion: How the vehicle moves then.
-            seed: Of the episode.
-            frame: The image's number in the episode, by the camera's rate: frames that nobody
-                takes count, as of `noise.noisy_frame`.
+            arena: The arena.
+            elapsed_us: Time since the episode's start, at the middle of the exposure and of the
+                rows [µs].
+            motion: Motion of the vehicle then.
+            seed: Seed of the episode.
+            frame: Number in the episode by the camera's rate, skipped frames included.
 
         Raises:
-            UsageError: The file of a mesh cannot be read, or is another one.
+            UsageError: A mesh's file is missing or has changed.
         """
         asked = self._imaging
         off = _off_by(asked, seed, self._own)
@@ -156,10 +152,7 @@ class ImageFormation:
         off: float,
         frame: int,
     ) -> float:
-        """Return the gain of an image whose mean light shall be the target's, times `off`.
-
-        Light that is linear in the gain would be there at once; what is white or black is not.
-        """
+        """Return the gain for the target's mean light, times `off`; extremes saturate."""
         settles = self.gain is None or auto.time_constant_s == 0.0
         gain = 1.0 if settles or self.gain is None else self.gain
         for _ in range(MOST_METERED if settles else 1):

@@ -63,8 +63,8 @@ class Intrinsics:
     ) -> Intrinsics:
         """Return the intrinsics of a camera with a horizontal field of view [rad].
 
-        It is in (0, pi) for a pinhole, in (0, 2 pi] for a cylinder, to 190 degrees for a fisheye.
-        The focal length is the one with which half of it falls on the edge of the image.
+        Up to pi for a pinhole, 2 pi for a cylinder, 190 degrees for a fisheye; half of it falls on
+        the edge of the image.
         """
         if projection != "pinhole":
             focal = width / (2.0 * distorted(0.5 * horizontal_fov, distortion))

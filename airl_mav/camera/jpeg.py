@@ -14,10 +14,7 @@ _MODES: Final = {1: "L", 3: "RGB"}
 
 
 def jpeg_of(image: NDArray[np.uint8], quality: int) -> bytes:
-    """Return an image (h, w, channels), grey or sRGB, as a JPEG file.
-
-    Chroma is at half the resolution (4:2:0), as cameras send it.
-    """
+    """Return an image (h, w, channels), grey or sRGB, as a JPEG file with 4:2:0 chroma."""
     from PIL import Image
 
     written = io.BytesIO()
@@ -27,10 +24,10 @@ def jpeg_of(image: NDArray[np.uint8], quality: int) -> bytes:
 
 
 def image_of(data: bytes, height: int, width: int, channels: int) -> NDArray[np.uint8]:
-    """Return the image (h, w, channels) of a JPEG file, which must have this size.
+    """Return the image (h, w, channels) of a JPEG file of this size.
 
     Raises:
-        ValueError: It is no JPEG, is damaged, or has another size or other channels.
+        ValueError: It is damaged, or has another size or other channels.
         UsageError: Pillow is not installed.
     """
     try:

@@ -46,9 +46,9 @@ def draw_drops(
 
     Args:
         rgb: (h, w, 3) sRGB, changed.
-        dry: (h, w, 3) room to work in.
-        drops: (k, 4) of each the place of its middle, in widths and heights of the image from the
-            left and the top, its width in widths of the image, and its height in its widths.
+        dry: (h, w, 3) buffer.
+        drops: (k, 4) middle in widths and heights of the image from left and top, width in image
+            widths, height in drop widths.
         light_of: (256,) `image_sensor.LIGHT_OF`.
     """
     height, width, _ = rgb.shape

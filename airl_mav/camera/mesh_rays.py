@@ -15,13 +15,9 @@ from airl_mav.vehicle.rotation import Vec
 
 @borrowing_kernel
 def _through(boxes: NDArray[np.float32], node: int, at: Vec, inverse: Vec) -> tuple[float, float]:
-    """Return where a ray enters and leaves a node's box; it leaves before it enters: never.
+    """Return where a ray from `at`, of component inverses, enters and leaves a node's box.
 
-    Args:
-        boxes: `Bvh.boxes`.
-        node: Which one.
-        at: (3,) where the ray begins.
-        inverse: (3,) one over each of its components.
+    It misses the box if it leaves first.
     """
     i0, i1, i2 = inverse
     a, b, c = (
@@ -44,17 +40,17 @@ def stopped_by(
     last: int,
     waiting: NDArray[np.int32],
 ) -> int:
-    """Return a triangle between a point and the sun, -1: there is none.
+    """Return a triangle between a point and the sun; -1 = none. Units are the mesh's.
 
     Args:
         bvh: The trees.
         root: The mesh's.
-        at: (3,) the point, from the mesh's origin, with all else in units of the mesh.
+        at: (3,) the point, from the mesh's origin.
         sun: (3,) unit vector.
         inverse: (3,) one over each of its components.
-        least: Triangles nearer than this do not count.
-        last: One that hid the point before: it is likely to hide this one.
-        waiting: (STACK,) room to work in.
+        least: Minimum distance.
+        last: Triangle that hid the previous point, tested first.
+        waiting: (STACK,) buffer.
     """
     if last >= 0 and _stops(bvh.corners, last, at, sun, least):
         return last
@@ -89,16 +85,16 @@ def distance_to(
     most: float,
     waiting: NDArray[np.int32],
 ) -> tuple[float, int]:
-    """Return how far away a ray meets a mesh first, and which triangle; -1: it meets none.
+    """Return distance and triangle of a ray's first hit; -1 = none. Units are the mesh's.
 
     Args:
         bvh: The trees.
         root: The mesh's.
-        at: (3,) where the ray begins, from the mesh's origin, with all else in units of the mesh.
+        at: (3,) where the ray begins, from the mesh's origin.
         way: (3,) its direction.
-        least: Triangles nearer than this do not count.
-        most: Nor do those that are farther than this.
-        waiting: (STACK,) room to work in.
+        least: Minimum distance.
+        most: Maximum distance.
+        waiting: (STACK,) buffer.
     """
     inverse = (inverse_of(way[0]), inverse_of(way[1]), inverse_of(way[2]))
     boxes, links = bvh.boxes, bvh.links
@@ -131,10 +127,7 @@ def _stops(corners: NDArray[np.float32], i: int, at: Vec, way: Vec, least: float
 
 @borrowing_kernel
 def _distance(corners: NDArray[np.float32], i: int, at: Vec, way: Vec) -> float:
-    """Return how far along a ray a triangle is hit, from either side; minus infinity: never.
-
-    Moller and Trumbore, Fast, minimum storage ray-triangle intersection, 1997.
-    """
+    """Return the distance of a triangle along a ray, or minus infinity (Moller, Trumbore, 1997)."""
     p0, p1, p2 = float(corners[i, 0]), float(corners[i, 1]), float(corners[i, 2])
     a0, a1, a2 = corners[i, 3] - p0, corners[i, 4] - p1, corners[i, 5] - p2
     b0, b1, b2 = corners[i, 6] - p0, corners[i, 7] - p1, corners[i, 8] - p2

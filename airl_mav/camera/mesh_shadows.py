@@ -53,17 +53,17 @@ def shade_by_meshes(
         lit: (n, m) changed: 0 in shadow.
         far: (n, m) depth [m].
         ids: (n, m) what is seen.
-        faces: (n, m) which of its triangles, where a mesh is seen.
-        corners: (CORNERS, 3) room to work in.
-        lines: Of the image.
+        faces: (n, m) the meshes' triangles.
+        corners: (CORNERS, 3) buffer.
+        lines: Of the image, as are `xs` and `bent`.
         xs: Rays of a line.
-        bent: A fisheye's rays, in place of both; None: it is another image.
-        view: How the image sees.
+        bent: A fisheye's rays instead of both; None: another projection.
+        view: The projection.
         axes: The camera's axes.
         camera: (3,) NED [m].
-        meshes: Those of the arena.
+        meshes: The arena's meshes.
         to_sun: (3,) unit vector NED.
-        gloss: What the surfaces let through; None: nothing.
+        gloss: Transmission of the surfaces; None: opaque.
     """
     waiting, maybe = np.empty(STACK, np.int32), np.empty(len(xs), np.bool_)
     for k in range(len(meshes.root)):
@@ -94,10 +94,7 @@ def _shade_by_mesh(
     waiting: NDArray[np.int32],
     maybe: NDArray[np.bool_],
 ) -> None:
-    """Put the points that mesh k hides into shadow; `maybe` (m,) is room to work in.
-
-    Of the sun's light it lets a share `through`.
-    """
+    """Put the points that mesh k hides into shadow but a share `through`; `maybe` is a buffer."""
     bvh, root, scale = meshes.bvh, meshes.root[k], meshes.pose[k, 4]
     cos, sin = meshes.pose[k, 2], meshes.pose[k, 3]
     pose = seen_from(axes, camera, meshes.pose, k)

@@ -54,30 +54,27 @@ def shade_meshes(
     atlas: Plane,
     pixel2: np.float32,
 ) -> None:
-    """Shade what is seen of the meshes of an arena.
-
-    Each triangle is flat. The pattern lies on it as seen along that axis of the mesh that its
-    normal is nearest to, and begins in the mesh's origin.
+    """Shade the visible flat triangles of meshes, with a pattern along the nearest mesh axis.
 
     Args:
         out: (n,) packed colours, written.
         ids: (n,) what is seen.
         far: (n,) depth [m].
         lit: (n,) 1 in the sun, 0 in shadow.
-        clear: (n,) share of light that the fog lets through.
-        points: Room to work in.
-        rectangles: (obstacles + meshes, 3, 4) of each mesh the pixels, in its first place.
-        meshes: Those of the arena.
-        faces: (n,) which of its triangles is seen.
-        lines: Of the image.
+        clear: (n,) transmission of the fog.
+        points: Buffer.
+        rectangles: (obstacles + meshes, 3, 4) pixels of each mesh, in its first place.
+        meshes: The arena's meshes.
+        faces: (n,) the visible triangle.
+        lines: Of the image, as are `xs` and `bent`.
         xs: Rays of a line.
-        bent: A fisheye's rays, in place of both; None: it is another image.
+        bent: A fisheye's rays instead of both; None: another projection.
         axes: The camera's axes.
         camera: (3,) NED [m].
         texture: As of `colour.render_colour`, with the next three.
-        per_m: Periods of the pattern for a metre.
-        offset: Where it begins.
-        albedo: Of both its ends.
+        per_m: Periods of the pattern per metre.
+        offset: Origin of the pattern.
+        albedo: Both ends of the pattern.
         light: The light.
         atlas: `textures.atlas()`.
         pixel2: Square of the side of a pixel at a depth of 1.

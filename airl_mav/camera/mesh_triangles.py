@@ -84,10 +84,7 @@ def between(
     bottom: float,
     outer: Rectangle,
 ) -> Rectangle:
-    """Return the pixels of a part that see anything of a box along the camera's axes.
-
-    What of it lies behind the image plane is not seen: there the slopes have no bound.
-    """
+    """Return the pixels that see a box along the camera's axes, in front of the image plane."""
     per_near, per_far = 1.0 / max(near, NEAR), 1.0 / max(far, NEAR)
     return pixels(
         view,
@@ -253,9 +250,9 @@ def draw_triangle(
 def met(
     corners: NDArray[np.float32], i: int, view: View, pose: Pose, start: Vec, x: float
 ) -> float:
-    """Return the inverse depth of a triangle along a ray, as `draw_triangle`; 0: it misses it.
+    """Return a triangle's inverse depth along a ray, as `draw_triangle`; 0 = missed.
 
-    Where the view is no pinhole's it is not kept within the depths of the triangle's corners.
+    Only a pinhole's depth is kept within those of the corners.
     """
     c, f, r = pose.center, pose.forward, pose.along
     p0 = (c[0] + corners[i, 0], c[1] + corners[i, 1], c[2] + corners[i, 2])

@@ -42,14 +42,7 @@ _MOST_LOOKED_AT: Final = 256
 
 @borrowing_kernel
 def seen_from(axes: Pose, camera: Vec, pose: NDArray[np.float64], k: int) -> Pose:
-    """Return the camera's axes along mesh k's, and its origin from the camera, in units of it.
-
-    Args:
-        axes: The camera's axes.
-        camera: (3,) NED [m].
-        pose: `Meshes.pose`.
-        k: Number of the mesh.
-    """
+    """Return the camera's axes along mesh k's, and its origin from the camera, in units of it."""
     per = 1.0 / pose[k, 4]
     offset = (pose[k, 0] - camera[0], pose[k, 1] - camera[1], pose[k, 5] - camera[2])
     at = (per * offset[0], per * offset[1], per * offset[2])
@@ -74,17 +67,17 @@ def draw_meshes(
 
     Args:
         out: (n, m) inverse depth [1/m], changed.
-        ids: (n, m) what each pixel sees, changed; None: nobody asks.
-        faces: (n, m) the triangle that each pixel sees, written where it sees one; None as `ids`.
-        drawn_in: (obstacles + meshes, 3, 4) written behind the obstacles, in the first place of
-            each: the rectangle that a mesh may be seen in; None as `ids`.
-        lines: Of the image, with the next two.
+        ids: (n, m) what each pixel sees, changed; None = not needed.
+        faces: (n, m) visible triangles, written; None as `ids`.
+        drawn_in: (obstacles + meshes, 3, 4) rectangle of each mesh, written behind the obstacles in
+            its first place; None as `ids`.
+        lines: Of the image, as are `xs` and `bent`.
         xs: Rays of a line.
-        bent: A fisheye's rays, in place of both; None: it is another image.
-        view: How the image sees.
+        bent: A fisheye's rays instead of both; None: another projection.
+        view: The projection.
         axes: The camera's axes.
         camera: (3,) NED [m].
-        meshes: Those of the arena.
+        meshes: The arena's meshes.
     """
     waiting = np.empty((STACK, 5), np.int32)
     nearest = np.empty(STACK)
@@ -261,10 +254,7 @@ def _cast(
     waiting: NDArray[np.int32],
     tops: int,
 ) -> None:
-    """Draw what one ray, that of its line and x along it, hits of a node.
-
-    Those that wait are in front of `waiting[tops]`.
-    """
+    """Draw a ray's hits in a node; the stack lies before `waiting[tops]`."""
     c, r = pose.center, pose.along
     ray = (start[0] + x * r[0], start[1] + x * r[1], start[2] + x * r[2])
     i0, i1, i2 = inverse_of(ray[0]), inverse_of(ray[1]), inverse_of(ray[2])
@@ -335,20 +325,10 @@ def _through(
     v1: float,
     v2: float,
 ) -> tuple[float, float]:
-    """Return where a ray enters and leaves a node's box; it leaves before it enters: never.
+    """Return where a ray enters and leaves a node's box; it misses the box if it leaves first.
 
-    Args:
-        boxes: `Bvh.boxes`.
-        node: Which one.
-        c0: Of the mesh's origin from where the ray begins, over the ray, with the next two.
-        c1: The same along the second axis.
-        c2: Along the third.
-        i0: One over the ray, with the next two.
-        i1: The same along the second axis.
-        i2: Along the third.
-        v0: Amounts of these, with the next two.
-        v1: Along the second axis.
-        v2: Along the third.
+    `c` is the mesh's origin from the ray's start over the ray, `i` one over the ray and `v` the
+    amounts of these, along the three axes.
     """
     a, b, c = c0 + boxes[node, 0] * i0, c1 + boxes[node, 1] * i1, c2 + boxes[node, 2] * i2
     w0, w1, w2 = boxes[node, 3] * v0, boxes[node, 4] * v1, boxes[node, 5] * v2

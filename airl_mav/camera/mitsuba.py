@@ -54,13 +54,12 @@ def path_traced(
     """Return the sRGB image (height, width, 3) of an arena by Mitsuba's path tracer.
 
     Args:
-        arena: What is seen.
+        arena: The arena.
         centers: (n, 3) present obstacle centres NED [m].
         intrinsics: The camera.
         position: (3,) camera NED [m].
         quaternion: (4,) unit [w, x, y, z] camera -> NED.
-        samples: Paths a pixel; of a cylinder and a fisheye in the middle of the image, elsewhere
-            between two thirds and several times as many.
+        samples: Paths per pixel; approximate off the middle of a cylinder or fisheye.
         seed: Of the paths.
 
     Raises:
@@ -343,14 +342,10 @@ def _hills(mi: Any, finish: Finish, ground: Ground) -> Any:
 
 
 def _triangles(mi: Any, finish: Finish, row: int, corners: Floats, placed: Floats) -> Any:
-    """Return flat triangles whose pattern lies on them as `mesh_surfaces` has it.
+    """Return flat triangles with a pattern as in `mesh_surfaces`.
 
-    Args:
-        mi: Mitsuba.
-        finish: The materials.
-        row: Which of them.
-        corners: (m, 3, 3) along the axes of the mesh [m].
-        placed: (m, 3, 3) the same NED [m].
+    `corners` (m, 3, 3) are along the mesh's axes, `placed` (m, 3, 3) NED [m]; `row` is the
+    material.
     """
     normals = np.abs(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     q0, q1, q2 = normals.T[..., None]

@@ -42,12 +42,7 @@ class Matching(NamedTuple):
 
 
 def matching_of(camera: Camera, share: float = 1.0) -> Matching | None:
-    """Return the constants of a profile's camera; None: it is no stereo camera, or an ideal one.
-
-    Args:
-        camera: The camera.
-        share: The disparity's noise times this; 0 makes an ideal camera of it.
-    """
+    """Return a stereo camera's constants, its disparity noise times `share`; None for others."""
     stereo = camera.stereo
     if stereo is None or share == 0.0:
         return None
@@ -122,10 +117,7 @@ class DepthNoise(NamedTuple):
 
 
 def noise_of(camera: Camera, asked: SensorNoise, name: str = "") -> DepthNoise | None:
-    """Return what happens to the images of a camera; None: nothing, as where it gives no depth.
-
-    `name` is that of a further camera, whose noise is drawn apart.
-    """
+    """Return the noise of a depth camera or None; `name` seeds an additional camera's."""
     if camera.kind != "depth":
         return None
     matching = matching_of(camera, asked.stereo_noise)
@@ -139,14 +131,10 @@ def noise_of(camera: Camera, asked: SensorNoise, name: str = "") -> DepthNoise |
 def noisy_frame(
     depth_mm: NDArray[np.uint16], noise: DepthNoise, seed: int, frame: int
 ) -> NDArray[np.uint16]:
-    """Return a frame of an episode as its noise leaves it.
+    """Return a Z16 image (h, w) of an episode with noise.
 
-    Args:
-        depth_mm: Z16 image (h, w).
-        noise: What happens to it.
-        seed: Of the episode.
-        frame: Its number in the episode, by the camera's rate: frames that nobody takes count, so
-            that the same moment has the same noise wherever it is flown.
+    `frame` is its number by the camera's rate, skipped frames included, so that the same moment has
+    the same noise at every level.
     """
     if noise.matching is not None:
         rng = stream(seed, Stream.STEREO, frame, *noise.own)
@@ -163,14 +151,7 @@ def noisy_frame(
 def ranged_depth(
     depth_mm: NDArray[np.uint16], ranging: Ranging, range_m: float, rng: np.random.Generator
 ) -> NDArray[np.uint16]:
-    """Return a true Z16 image (h, w) as a lidar measures it; 0 = no return.
-
-    Args:
-        depth_mm: The image.
-        ranging: How it measures.
-        range_m: Greatest depth that gives a return [m].
-        rng: What draws.
-    """
+    """Return a true Z16 image (h, w) as a lidar measures it up to `range_m` [m]; 0 = no return."""
     depth = depth_mm / MM_PER_M
     sd = np.hypot(ranging.noise_m, ranging.noise_share * depth)
     measured = depth + sd * rng.standard_normal(depth.shape)

@@ -38,14 +38,10 @@ def periods_around(radius: float, per_m: np.float32) -> np.float32:
 def on_box(
     a: np.float32, b: np.float32, c: np.float32, on_c: bool, on_a: bool
 ) -> tuple[np.float32, np.float32]:
-    """Return a place in the pattern of a face [m]: it begins in the middle of each.
+    """Return the place [m] in the pattern of a box face, from its middle.
 
-    Args:
-        a: Along the first axis of the box, from its centre, with the next two.
-        b: Along the second.
-        c: Down.
-        on_c: The face is the upper or the lower one.
-        on_a: Else, it is one of those across the first axis.
+    `a`, `b` and `c` (down) are box coordinates from the centre; `on_c` marks upper and lower faces,
+    otherwise `on_a` those across the first axis.
     """
     across = a if on_c else (b if on_a else a)
     along = b if on_c else c

@@ -77,12 +77,9 @@ def render_picture(
     quaternion: Quat | NDArray[np.float64],
     gain: float = 1.0,
 ) -> Picture:
-    """Return the colour image of an arena, with depth and what is seen; arguments as of `render`.
+    """Return the colour image, unlimited depth and what is seen; arguments as of `render`.
 
-    Depth has no limit of range. All light is times `gain`, before it becomes numbers.
-
-    Raises:
-        UsageError: The file of a mesh cannot be read, or is another one.
+    All light is multiplied by `gain` before quantization.
     """
     k, obstacles, look = intrinsics, arena.obstacles, ColourArrays.of(arena.look)
     shape = (k.height, k.width)
@@ -154,10 +151,7 @@ def antialiased(
     quaternion: Quat | NDArray[np.float64],
     side: int,
 ) -> NDArray[np.uint8]:
-    """Return the sRGB image (height, width, 3) of side x side rays a pixel: their mean of light.
-
-    The sensor has one ray a pixel (`render_picture`, with the other arguments); this is for people.
-    """
+    """Return the sRGB image of side x side rays per pixel, for people; the sensor has one."""
     k, fine = intrinsics, finer(intrinsics, side)
     codes = render_picture(arena, centers, fine, position, quaternion).rgb
     light = linear_of(np.arange(256) / 255.0)[codes]

@@ -156,21 +156,10 @@ def _draw_room_around(
     lid: float,
     lid_seen: float,
 ) -> None:
-    """Draw the room that the camera is in, as `draw_room`: it is entered nowhere, only left.
+    """Draw the room that the camera is in, as `draw_room`: rays only leave it.
 
-    Args:
-        out: As of `draw_room`, with those up to `pose`.
-        ids: What is seen.
-        lines: Of the image.
-        xs: Rays of a line.
-        bent: A fisheye's rays.
-        view: How the image sees.
-        pose: The camera's axes.
-        north: Between two walls.
-        east: Between the others.
-        floor: Inverse of its depth below the camera [1/m].
-        lid: That of the lid; negative, as it is above.
-        lid_seen: 1: it is a ceiling; 0: it is open.
+    `north` and `east` are slabs between walls, `floor` and `lid` inverse depths below and,
+    negative, above the camera [1/m]; `lid_seen` is 1 for a ceiling, 0 for an open room.
     """
     for v in range(out.shape[0]):
         start = _line_start(pose, lines[v, 0], lines[v, 1])

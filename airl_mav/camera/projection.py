@@ -92,10 +92,7 @@ def dot(a: Vec, b: Vec) -> float:
 
 @kernel
 def _span(forward: float, lateral: float, radius: float) -> tuple[float, float]:
-    """Return the slopes lateral / forward of the tangents from the origin to a circle.
-
-    The circle reaches in front of the image plane (forward > -radius).
-    """
+    """Return the slopes lateral / forward of tangents to a circle that reaches in front."""
     square = forward * forward + lateral * lateral - radius * radius
     if square <= 0.0:
         return -_WIDE, _WIDE
@@ -163,11 +160,9 @@ def pinhole_rectangle(out: Image, view: View, pose: Pose, half: Vec, sphere: boo
 
 @borrowing_kernel
 def cylinder_span(out: Image, view: View, pose: Pose, half: Vec, sphere: bool) -> Span:
-    """Return the pixels of a cylinder that can see a body; no pixels of a line when none can.
+    """Return the pixels of a cylinder that can see a body; arguments as of `pinhole_rectangle`.
 
-    The lines are those around the body's bearing, of which one more turn of the cylinder, or one
-    less, may fall into the image (`cut`). Arguments as of `pinhole_rectangle`; the image's lines
-    are the columns.
+    Lines are columns around the body's bearing, to which `cut` adds a turn of the cylinder.
     """
     f, r, d, c = pose.forward, pose.across, pose.along, pose.center
     z, x, y = dot(f, c), dot(r, c), dot(d, c)
@@ -207,10 +202,9 @@ def cut(out: Image, view: View, span: Span, turns: int) -> Rectangle:
 def fisheye_rectangle(
     out: Image, view: View, bent: Bent, pose: Pose, half: Vec, sphere: bool
 ) -> Rectangle:
-    """Return the pixels of a fisheye that can see a body; empty when none can.
+    """Return the pixels of a fisheye that can see a body; arguments as of `pinhole_rectangle`.
 
-    They bound the part of a ring that the sphere around the body falls into: directions as far from
-    the optical axis, and in as many of the planes through it. Arguments as of `pinhole_rectangle`.
+    They bound the ring segment of the sphere around the body.
     """
     f, r, d, c = pose.forward, pose.along, pose.across, pose.center
     z, x, y = dot(f, c), dot(r, c), dot(d, c)

@@ -115,10 +115,7 @@ def albedo_at(
 
 @kernel
 def sky_at(light: Lit, ray: Vec, down: float) -> Vec:
-    """Return the sky's linear RGB, and below the horizon the ground's, as `draw_sky` has them.
-
-    `down`: of where the ray begins, NED [m].
-    """
+    """Return linear RGB of the sky, or of the ground below the horizon, as `draw_sky`."""
     rise, through = -ray[2], 1.0
     if light.extinction > 0.0:
         thick = FOG_LAYER_M if rise > 0.0 else max(-down, 1e-3)

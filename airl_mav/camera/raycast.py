@@ -150,15 +150,15 @@ def aim(
     """Write the rays of an image's lines; return how it sees, and its axes about no centre.
 
     Args:
-        lines: (n, 2) written: how much of the forward axis, and of the axis across, is in the first
-            ray of each line.
-        xs: (m,) written: how much of the axis along is in each ray of a line.
+        lines: (n, 2) written: parts of the forward axis and of the axis across in each line's first
+            ray.
+        xs: (m,) written: part of the axis along in each ray of a line.
         quaternion: As of `render_depth`, with the others.
         focal: Focal length.
         cx: Column of the optical axis.
         cy: Row of the optical axis.
         cylindrical: The image is a cylinder's.
-        max_range: Greatest depth [m].
+        max_range: Maximum depth [m].
     """
     q = (quaternion[0], quaternion[1], quaternion[2], quaternion[3])
     forward, right, down = (
@@ -201,18 +201,17 @@ def draw_bodies(
     meshes: Meshes | None,
     faces: Faces | None,
 ) -> int:
-    """Write the inverse depth of an arena, line by line; 0 = no return.
+    """Write the inverse depth of an arena; return the obstacle around the camera, or -1.
 
     Args:
-        out: (n, m) inverse depth [1/m], written.
-        ids: (n, m) written: what each pixel sees, CEILING, SKY, ... or OBSTACLE + its number, or
-            GROUND where that is hills; None: nobody asks, and nothing is spent on it.
-        drawn_in: (obstacles + meshes, 3, 4) written: the rectangles that each obstacle, and each
-            mesh, was drawn in; None: nobody asks.
+        out: (n, m) inverse depth [1/m], written; 0 = no return.
+        ids: (n, m) written: CEILING, SKY, ..., OBSTACLE + number, or GROUND for hills; None = not
+            needed, at no cost.
+        drawn_in: (obstacles + meshes, 3, 4) written: their rectangles; None = not needed.
         lines: Of `aim`, with the next three.
         xs: Rays of a line.
-        bent: A fisheye's rays, in place of both; None: it is another image.
-        view: How the image sees.
+        bent: A fisheye's rays instead of both; None: another projection.
+        view: The projection.
         axes: The camera's axes.
         camera: (3,) NED [m], above the floor.
         bounds: As of `render_depth`, with the rest.
@@ -221,10 +220,7 @@ def draw_bodies(
         half_size: (n, 3).
         yaw: (n,).
         meshes: As of `render_depth`.
-        faces: (n, m) written where a mesh is seen: which of its triangles; None: nobody asks.
-
-    Returns:
-        Which obstacle the camera is inside of; -1: of none.
+        faces: (n, m) written: visible triangles of meshes; None = not needed.
     """
     room = (
         0.5 * (bounds[0] + bounds[1]) - camera[0],

@@ -12,10 +12,7 @@ from airl_mav.camera.intrinsics import Intrinsics
 
 
 def rays_of(camera: Intrinsics) -> NDArray[np.float64]:
-    """Return the rays (3, h, w) of a camera's pixels at a depth of 1: forward, right, down.
-
-    They are 0 where a pixel lies outside of a fisheye's circle, and sees nothing.
-    """
+    """Return rays (3, h, w) forward, right, down at a depth of 1; 0 outside a fisheye's circle."""
     if camera.projection == "fisheye":
         return fisheye_rays(camera)
     rays = np.ones((3, camera.height, camera.width))

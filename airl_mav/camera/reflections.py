@@ -107,20 +107,10 @@ def draw_reflections(
     meshes: Meshes | None,
     look: Look,
 ) -> None:
-    """Draw the pixels again that see a surface which is not matt.
+    """Redraw the pixels of surfaces that are not matt; `look` is the appearance of the arena.
 
-    Args:
-        out: (n,) packed colours, changed.
-        ids: (n,) what is seen.
-        rays: Of the pixels.
-        camera: (3,) NED [m].
-        bounds: As of `render_depth`, with the rest up to `meshes`.
-        shape: (n,).
-        center: (n, 3).
-        half_size: (n, 3).
-        yaw: (n,).
-        meshes: Those that are seen; None: there are none.
-        look: How all of that looks.
+    `out` (n,) are packed colours, `ids` (n,) what is seen, `rays` those of the pixels, `camera`
+    (3,) NED [m]; the rest as of `render_depth`.
     """
     tree, nodes = np.empty((_WAITING, _RAY)), np.empty(STACK, np.int32)
     colour, bodies = np.empty(3), bodies_of(bounds, shape, center, half_size, yaw)
@@ -262,10 +252,7 @@ def _pass(tree: NDArray[np.float64], tops: int, seen: Seen) -> int:
 def _scatter(
     colour: NDArray[np.float64], seen: Seen, kind: int, light: Lit, arrives: float
 ) -> None:
-    """Add what a matt surface scatters, bare or below varnish.
-
-    `arrives`: share of the sun's light.
-    """
+    """Add the matt scattering of a bare or varnished surface; `arrives` = share of sunlight."""
     facing, enters, sun_enters = max(dot(seen.normal, _sun(light)), 0.0), 1.0, 1.0
     if kind == GLOSSY:
         # Light from all sides that the varnish lets in, is scattered below it, thrown back by the
@@ -281,9 +268,9 @@ def _scatter(
 
 @large_borrowing_kernel
 def _shine(colour: NDArray[np.float64], seen: Seen, kind: int, light: Lit, arrives: float) -> None:
-    """Add the sun's highlight on a rough surface; a mirror shows it as the point that it is.
+    """Add the sun's highlight on a rough surface; mirrors show the sun itself.
 
-    Mirrored by a rough surface it is as wide as that one's own: eight rays would show it eight
+    A mirrored highlight is widened by the mirror's roughness, since eight rays would show it eight
     times (Kaplanyan and Dachsbacher, Path space regularization, 2013).
     """
     if arrives == 0.0 or is_smooth(seen.alpha):

@@ -66,16 +66,7 @@ def carried_on(motion: Motion, seconds: float) -> tuple[Vec, Quat]:
 def camera_pose(
     position: Vec | NDArray[np.float64], quaternion: Quat | NDArray[np.float64], mount: Mount
 ) -> tuple[Vec, Quat]:
-    """Return the pose of a camera on a vehicle.
-
-    Args:
-        position: (3,) vehicle NED [m].
-        quaternion: (4,) unit [w, x, y, z] vehicle body -> NED.
-        mount: The camera's place on the body.
-
-    Returns:
-        Position NED [m] and quaternion [w, x, y, z] of the camera, as `render_depth` takes them.
-    """
+    """Return NED position [m] and quaternion of a camera mounted on a vehicle's pose."""
     q = (quaternion[0], quaternion[1], quaternion[2], quaternion[3])
     x, y, z = rotate(q, mount.offset)
     # A positive turn about the body's right axis lifts the nose.
@@ -100,15 +91,15 @@ def render(
     Depth passes through obstacles of glass, and sees what is behind them.
 
     Args:
-        arena: What is seen.
-        centers: (n, 3) present obstacle centres NED [m], as `Arena.centers_at` gives them.
+        arena: The arena.
+        centers: (n, 3) present obstacle centres NED [m], as of `Arena.centers_at`.
         intrinsics: The camera.
-        max_range: Greatest depth that gives a return [m].
+        max_range: Maximum depth [m].
         position: (3,) camera NED [m].
         quaternion: (4,) unit [w, x, y, z] camera -> NED; its x axis is the optical axis.
 
     Raises:
-        UsageError: The file of a mesh cannot be read, or is another one.
+        UsageError: A mesh's file is missing or has changed.
     """
     k, obstacles = intrinsics, arena.obstacles
     image = np.empty((k.height, k.width), np.float32)

@@ -177,15 +177,7 @@ def _from_mesh(meshes: Meshes, k: int, origin: Vec, ray: Vec) -> tuple[Vec, Vec]
 def meet(
     bodies: Bodies, meshes: Meshes | None, origin: Vec, ray: Vec, waiting: NDArray[np.int32]
 ) -> Met:
-    """Return what a ray meets first.
-
-    Args:
-        bodies: Obstacles and room.
-        meshes: Those that are seen; None: there are none.
-        origin: (3,) where it begins, NED [m].
-        ray: (3,) unit vector NED.
-        waiting: (STACK,) room to work in.
-    """
+    """Return the first hit of a ray from `origin` NED [m]; `waiting` (STACK,) is a buffer."""
     best, seen = _room(bodies.bounds, origin, ray)
     mesh, face = -1, -1
     for i in range(len(bodies.shape)):
@@ -282,16 +274,16 @@ def sunlight(
     to_sun: Vec,
     waiting: NDArray[np.int32],
 ) -> float:
-    """Return the share of the sun's light that reaches a point: 1 in the sun, 0 in shadow.
+    """Return the share of the sun's light that reaches a point.
 
     Args:
         bodies: Obstacles and room.
-        meshes: Those that are seen; None: there are none.
-        lets: (2 + n,) share that each surface lets through, `Gloss.lets`.
-        own: What the point lies on, as `Met.seen`: a convex body is dark where it faces away.
-        at: (3,) the point, off the surface by a little where that is a mesh's, NED [m].
+        meshes: Visible meshes; None: none.
+        lets: (2 + n,) transmission of each surface, `Gloss.lets`.
+        own: Surface of the point, as `Met.seen`: a convex body shades itself.
+        at: (3,) the point, slightly off a mesh's surface, NED [m].
         to_sun: (3,) unit vector NED.
-        waiting: (STACK,) room to work in.
+        waiting: (STACK,) buffer.
     """
     share = 1.0
     bounds = bodies.bounds

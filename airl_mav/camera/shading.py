@@ -117,12 +117,9 @@ def _part(x: np.float32) -> np.float32:
 
 @kernel
 def texel_at(u: np.float32, v: np.float32, texels2: np.float32) -> np.int32:
-    """Return where the nearest texel lies in a pattern, of the level whose texels fit a pixel.
+    """Return the nearest texel at (u, v), in periods, of the level that fits a pixel.
 
-    Args:
-        u: Place across, in periods.
-        v: Place down, in periods.
-        texels2: Square of the texels of the finest level that a pixel covers, each way.
+    `texels2`: square of the texels of the finest level that a pixel covers, each way.
     """
     # Half the exponent of a float is the logarithm of its root; the side is 2 to its opposite.
     exponent = I32(F32(texels2 + texels2).view(I32) >> 23) - I32(127)
@@ -136,17 +133,11 @@ def texel_at(u: np.float32, v: np.float32, texels2: np.float32) -> np.int32:
 
 @kernel
 def irradiance(light: Lit, channel: int, direct: np.float32, rise: np.float32) -> np.float32:
-    """Return the irradiance of a surface in one channel of linear RGB.
+    """Return the irradiance of a surface in one channel (0, 1 or 2) of linear RGB.
 
-    The sky and the ground by the shares that a tilted plane sees of them, (1 + cos tilt) / 2 and
-    (1 - cos tilt) / 2 (Liu and Jordan, The long-term average performance of flat-plate solar-energy
-    collectors, 1963).
-
-    Args:
-        light: The light.
-        channel: 0, 1 or 2.
-        direct: Cosine of the angle between normal and sun, times the share of it that arrives.
-        rise: Cosine of the tilt: of the angle between normal and zenith.
+    Sky and ground by the shares (1 + cos tilt) / 2 and (1 - cos tilt) / 2 (Liu and Jordan, The
+    long-term average performance of flat-plate solar-energy collectors, 1963). `direct` is the
+    cosine of normal and sun times its share that arrives, `rise` that of normal and zenith.
     """
     # What an upright plane gets of both, and how much more a level one.
     upright = HALF * (light.sky[channel] + light.ground[channel])
@@ -169,19 +160,17 @@ def paint(
     light: Lit,
     atlas: Plane,
 ) -> None:
-    """Write the packed sRGB of a part of an image where it sees a surface.
-
-    Lambert's law; fog by Beer-Lambert's law.
+    """Write the packed sRGB of left..end where `seen` is first..last; Lambert's and Beer's laws.
 
     Args:
         out: (n,) packed colours, written.
         seen: (n,) what is seen.
         lit: (n,) 1 in the sun, 0 in shadow.
-        clear: (n,) share of light that the fog lets through.
-        left: Where the part begins.
-        end: Where it ends.
-        first: Least number of this surface in `seen`.
-        last: Greatest.
+        clear: (n,) transmission of the fog.
+        left: Start of the part.
+        end: End of the part.
+        first: Lowest number of this surface in `seen`.
+        last: Highest.
         points: The part's points.
         surface: Its material.
         light: The light.
@@ -218,10 +207,9 @@ def paint(
 
 @kernel
 def encoded(x: np.float32) -> np.int32:
-    """Return linear light as an sRGB number, 0..255 (IEC 61966-2-1).
+    """Return linear light as an sRGB number, 0..255 (IEC 61966-2-1); negative light is black.
 
-    The power is a polynomial of the root, fitted for the least greatest error: 0.09 of a step.
-    Nothing is darker than 0.
+    The power is a minimax polynomial of the root, accurate to 0.09 of a step.
     """
     x = min(x, ONE)
     s = np.sqrt(x)
@@ -243,10 +231,7 @@ def packed(red: np.float32, green: np.float32, blue: np.float32) -> np.int32:
 
 @kernel
 def turn_of(y: np.float32, x: np.float32) -> np.float32:
-    """Return the angle of a direction in turns, -0.5..0.5, to 1e-5.
-
-    An odd polynomial for the angle below 45 degrees, fitted for the least greatest error.
-    """
+    """Return the angle of a direction in turns, -0.5..0.5, to 1e-5, by a minimax polynomial."""
     ax, ay = abs(x), abs(y)
     z = min(ax, ay) / max(max(ax, ay), LEAST)
     z2 = z * z

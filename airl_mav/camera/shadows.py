@@ -42,10 +42,10 @@ def sized(value: float) -> float:
 
 @kernel
 def widened(left: int, end: int, low: int, high: int) -> tuple[int, int]:
-    """Return the pixels left..end with their neighbours from low to high, in whole vectors.
+    """Return the pixels left..end widened within low..high to whole vectors.
 
-    What is left over of a loop for vectors is done one by one: for what is small, all of it. They
-    begin where the pixels do: few pixels across a vector's boundary would be two.
+    The rest of a vectorized loop runs one by one. Vectors begin where the pixels do, since few
+    pixels across a boundary would need two.
     """
     whole = end - left + (left - end) % VECTOR
     first = max(min(left, high - whole), low)
@@ -64,18 +64,18 @@ def shade_by_walls(
     extinction: float,
     through: np.float32,
 ) -> None:
-    """Write which points the walls leave in the sun, and how much of their light fog lets through.
+    """Write the sunlight that passes the walls, and the transmission of fog.
 
     Args:
-        lit: (n,) written: share of the sun that arrives, 1 in the sun.
-        clear: (n,) written: share of light that fog on the way to the camera lets through.
+        lit: (n,) written: share of the sun that arrives.
+        clear: (n,) written: transmission of the fog to the camera.
         far: (n,) depth [m]; 0: no surface.
         rays: Of the pixels.
         camera: (3,) NED [m].
         bounds: (6,) of the arena.
         to_sun: (3,) unit vector NED.
         extinction: Of fog [1/m].
-        through: Share of the sun's light that the walls let through; 0 but of glass.
+        through: Transmission of the walls; 0 but for glass.
     """
     north, east, up = sized(to_sun[0]), sized(to_sun[1]), F32(-to_sun[2])
     # From the camera to the walls that the sunlight comes over.
@@ -151,19 +151,19 @@ def shade_by_obstacle(
         lit: (n, m) changed: times `through` in shadow.
         far: (n, m) depth [m].
         ids: (n, m) what is seen.
-        corners: (CORNERS, 3) room to work in.
+        corners: (CORNERS, 3) buffer.
         number: Of the obstacle.
-        lines: Of the image.
+        lines: Of the image, as are `xs` and `bent`.
         xs: Rays of a line.
-        bent: A fisheye's rays, in place of both; None: it is another image.
-        view: How the image sees.
+        bent: A fisheye's rays instead of both; None: another projection.
+        view: The projection.
         world: The camera's axes, and the obstacle's centre from the camera.
         camera: (3,) NED [m].
         shape: Of the obstacle, with the next two.
         half: Half extents [m].
         yaw: Heading of a box's first axis [rad].
         to_sun: (3,) unit vector NED.
-        through: Share of the sun's light that passes through it; 0 but of glass.
+        through: Transmission; 0 but for glass.
     """
     level = math.sqrt(to_sun[0] * to_sun[0] + to_sun[1] * to_sun[1])
     cos, sin = 1.0, 0.0
@@ -246,10 +246,10 @@ def shadow_rectangle(
     """Return the pixels of a pinhole that an obstacle's shadow volume projects to.
 
     Args:
-        corners: (CORNERS, 3) room to work in.
+        corners: (CORNERS, 3) buffer.
         n_lines: Lines of the image.
         n_pixels: Pixels of a line.
-        view: How the image sees.
+        view: The projection.
         pose: The camera's axes along the body's, and the body's centre from the camera.
         half: Half extents of the box around the body [m].
         sun: Unit vector towards the sun, along the body's axes.

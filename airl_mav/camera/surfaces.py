@@ -66,10 +66,7 @@ FOG_LAYER_M: Final = 100.0
 def span_of(
     ids: Ids, low: int, high: int, left: int, end: int, first: np.int32, last: np.int32
 ) -> tuple[int, int]:
-    """Return the pixels left..end from the first to the last that sees a surface.
-
-    They begin and end with whole vectors, from low to high. Its numbers are first..last.
-    """
+    """Return the part of left..end that sees surfaces first..last, in whole vectors."""
     seen, length = ids[left:end], I32(end - left)
     begin, stop = length, I32(0)
     for u in range(end - left):
@@ -100,11 +97,7 @@ def write_rays(rays: Rays, lines: Lines, xs: Line, bent: Bent | None, axes: Pose
 
 @borrowing_kernel
 def draw_sky(out: Packed, ids: Ids, points: Points, rays: Rays, camera: Vec, light: Lit) -> None:
-    """Write what is seen where there is no surface: sky, and below the horizon level ground.
-
-    The ground beyond the walls is as bright as the floor is in the mean. A ceiling takes the place
-    of the sky, and looks like it from everywhere.
-    """
+    """Write sky and, below the horizon, ground as bright as the mean floor; or the ceiling."""
     above = F32(max(-camera[2], MIN_DEPTH_M))
     zenith, horizon, ground = light.zenith, light.horizon, light.ground
     rises, clear = points.up, points.pattern
@@ -233,10 +226,10 @@ def shade_obstacle(
     atlas: Plane,
     pixel2: np.float32,
 ) -> None:
-    """Shade what is seen of an obstacle in a rectangle of the image.
+    """Shade an obstacle in a rectangle of the image.
 
-    The pattern of a box begins in the middle of each face. That of a cylinder goes round it in a
-    whole number of periods, that of a sphere by longitude and latitude.
+    A box's pattern begins in the middle of each face. A cylinder's goes round it in a whole number
+    of periods, a sphere's by longitude and latitude.
     """
     cos, sin = (math.cos(yaw), math.sin(yaw)) if shape == BOX else (1.0, 0.0)
     pose = turned(world, cos, sin)

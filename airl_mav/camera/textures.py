@@ -35,13 +35,10 @@ LEAST_PX, MOST_PX = 2, 4096
 
 @lru_cache(maxsize=2 * MOST_IMAGES)
 def texels_of(file: ImageFile, side: int) -> Floats:
-    """Return a picture (side, side, 3) in linear RGB 0..1, read once in a process.
-
-    Each texel is the mean of the light of what it covers; a smaller picture is interpolated.
+    """Return a picture (side, side, 3) in linear RGB 0..1, area-averaged or interpolated; cached.
 
     Raises:
-        UsageError: It cannot be read, is not the file that the profile was made with, or no picture
-            that can be a texture.
+        UsageError: It cannot be read, has changed, or cannot be a texture.
     """
     # Imported here: who flies without a simulation has no pictures to read.
     from PIL import Image
@@ -103,8 +100,7 @@ _OCTAVES: Final = 3
 def atlas(images: tuple[ImageFile, ...] = ()) -> NDArray[np.float32]:
     """Return all levels of all patterns (patterns * STRIDE,), in the order of TEXTURES.
 
-    Behind them those of images: red, green and blue of each. Raises UsageError for one that cannot
-    be read.
+    Red, green and blue of images follow; UsageError for an unreadable one.
     """
     planes = [np.moveaxis(texels_of(image, SIDE), -1, 0) for image in images]
     patterns = [*map(pattern, TEXTURES), *(plane for image in planes for plane in image)]
@@ -151,10 +147,7 @@ def _bricks(row: NDArray[np.intp], column: NDArray[np.intp]) -> Floats:
 
 
 def _value_noise(rng: np.random.Generator, cells: int, octaves: int) -> Floats:
-    """Return value noise that repeats: random values on a grid, smoothly interpolated.
-
-    Each octave has half the wavelength and half the amplitude of the one before.
-    """
+    """Return repeating value noise: each octave halves wavelength and amplitude."""
     total, weight = np.zeros((SIDE, SIDE)), 0.0
     for octave in range(octaves):
         n = cells << octave

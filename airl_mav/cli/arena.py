@@ -73,11 +73,7 @@ RENAMED_OPTIONS = {
 
 
 def run(options: ArenaOptions, console: Console | None = None) -> int:
-    """Print the arena's table and write its picture. Returns exit status 0.
-
-    Raises:
-        UsageError: The arena cannot be made, or the picture not be written there.
-    """
+    """Print the arena's table and write its picture; return 0."""
     console = console or new_console()
     if options.png is not None and options.png.suffix.lower() != ".png":
         raise FieldError("png", f"{options.png}", "a file name that ends in .png")

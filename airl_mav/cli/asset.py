@@ -68,11 +68,7 @@ OPTIONS = AssetOptions
 
 
 def run(options: AssetOptions, console: Console | None = None) -> int:
-    """Write the profile. Returns exit status 0.
-
-    Raises:
-        UsageError: The mesh cannot be used, or the profile not be written there.
-    """
+    """Write the asset's profile; return 0."""
     # Imported here: trimesh is an extra.
     from airl_mav.arena.mesh_boxes import boxes_of_mesh
 
@@ -129,11 +125,7 @@ def _told(made: MeshBoxes) -> str:
 def _files(
     options: AssetOptions, name: str, made: MeshBoxes, surface: Path | None
 ) -> dict[Path, bytes]:
-    """Return what is written where: the profile, and before it the file of the triangles.
-
-    Raises:
-        FieldError: There are too many triangles.
-    """
+    """Return file contents, the triangles before the profile; FieldError for too many triangles."""
     from airl_mav.arena.triangles import encoded
 
     if surface is None:

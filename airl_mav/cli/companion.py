@@ -37,10 +37,7 @@ OPTIONS = CompanionOptions
 
 
 def run(options: CompanionOptions, console: Console | None = None) -> int:
-    """Fly one mission.
-
-    Exit status: 0 the goal was reached, 1 it was not, 130 Ctrl-C.
-    """
+    """Fly one mission; return 0 if the goal was reached, else 1, or 130 after Ctrl-C."""
     console = console or new_console(soft_wrap=True)
     mission = prepare(options)
     stop, abandon, interrupted = threading.Event(), threading.Event(), threading.Event()

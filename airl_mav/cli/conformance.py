@@ -74,8 +74,8 @@ RENAMED_OPTIONS = {"--altitude": ("--altitude-m",), "--connect-timeout": ("--con
 def run(options: ConformanceOptions, console: Console | None = None) -> int:
     """Check a vehicle and print the result.
 
-    Exit status: 0 it conforms, 1 a check failed or a figure lies outside its tolerance, 130 Ctrl-C,
-    after landing. Raises UsageError as `check_conformance`, and for a folder that is not there.
+    Returns 0 if it conforms, 1 for a failed check or a figure outside its tolerance, 130 after
+    Ctrl-C and landing.
     """
     from airl_mav.conformance.report import check_table, line_text, step_table
     from airl_mav.conformance.run import check_conformance

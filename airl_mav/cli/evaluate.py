@@ -70,11 +70,7 @@ RENAMED_OPTIONS = RENAMED
 
 
 def run(options: EvaluateOptions, console: Console | None = None) -> int:
-    """Evaluate.
-
-    Exit status: 0 all episodes flown, 1 processes or workers were lost, 3 to 5 as of the verdict,
-    130 Ctrl-C.
-    """
+    """Evaluate; return 0, 1 (workers lost), 3 to 5 (verdict) or 130 (Ctrl-C)."""
     voice = Voice(options, "airl evaluate", console)
     scenario = scenario_of(options, policy=options.policies[0] if options.policies else None)
     each_fault = options.each_fault

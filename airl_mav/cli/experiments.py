@@ -65,21 +65,9 @@ def fly_and_show(
     gate: Gate = NOTHING_REQUIRED,
     telling: Telling = FOR_PEOPLE,
 ) -> tuple[int, ExperimentRun]:
-    """Fly what is left of an experiment and show the comparison of what is there.
+    """Fly the rest of an experiment and show the comparison; return exit status and what was flown.
 
-    Args:
-        experiment: What is flown.
-        out: Its folder; None: a new one.
-        console: Where it is shown; None: standard output.
-        gate: What is required.
-        telling: For whom it is shown.
-
-    Returns:
-        Exit status, 0 all episodes flown, 1 processes or workers were lost, 3 to 5 as of the
-        verdict, 130 Ctrl-C; and what was flown.
-
-    Raises:
-        UsageError: The input cannot be used.
+    The status is 0, 1 (workers lost), 3 to 5 (verdict) or 130 (Ctrl-C).
     """
     voice = Voice(telling, COMMANDS.get(experiment.kind, f"airl {experiment.kind}"), console)
     requirements = requirements_of(gate)

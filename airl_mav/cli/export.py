@@ -60,10 +60,7 @@ CHANGED = ("description", "decisions", *FLOWN)
 
 
 def run(options: ExportOptions, console: Console | None = None) -> int:
-    """Export, and print what was written. Raises UsageError as `airl_mav.training.export.export`.
-
-    Nothing was written then.
-    """
+    """Export a policy and print its files; raises as `airl_mav.training.export.export`."""
     console = console or new_console()
     if options.int8:
         card = _export_int8(options)

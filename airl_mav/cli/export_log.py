@@ -61,11 +61,7 @@ OPTIONS = ExportLogOptions
 
 
 def run(options: ExportLogOptions, console: Console | None = None) -> int:
-    """Write the files, or publish until Ctrl-C. Returns exit status 0.
-
-    Raises UsageError for a folder that holds no run, a flight that is not there, what is not
-    installed, a folder that cannot be made, or a taken port.
-    """
+    """Write the files, or publish until Ctrl-C; return 0."""
     console = console or new_console()
     if options.stream or options.format == "mcap":
         check_installed("export")

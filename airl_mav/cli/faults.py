@@ -82,14 +82,7 @@ OPTIONS = FaultsOptions
 
 
 def run(options: FaultsOptions, console: Console | None = None) -> int:
-    """Fly the matrix, show and save it.
-
-    Returns:
-        Exit status, 0 when every flight ended as documented, else 3.
-
-    Raises:
-        UsageError: A fault, a phase or the vehicle cannot be flown.
-    """
+    """Fly the matrix, show and save it; return 0 if every flight ended as documented, else 3."""
     console = console or new_console()
     phases = tuple(_phase(name) for name in options.phases)
     faults = [_without_time(fault) for fault in options.faults] or [c.fault for c in CASES]

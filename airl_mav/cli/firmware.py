@@ -35,10 +35,7 @@ OPTIONS = FirmwareOptions
 
 
 def run(options: FirmwareOptions, console: Console | None = None) -> int:
-    """Fly whatever the clients ask for, until Ctrl-C; in lockstep until the companion has ended.
-
-    Exit status: 0, or 1 when real firmware or the companion in lockstep was lost.
-    """
+    """Fly for clients until Ctrl-C, or the companion's end in lockstep; return 1 if it was lost."""
     console = console or new_console(soft_wrap=True)
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):

@@ -33,15 +33,7 @@ class Gate(ProfileModel):
 
 
 def requirements_of(gate: Gate, *, reference: bool = True) -> tuple[Requirement, ...]:
-    """Return what is required.
-
-    Args:
-        gate: The options.
-        reference: Whether a reference is flown, from which a gap can be taken.
-
-    Raises:
-        FieldError: One is no requirement, or asks for a gap from nothing.
-    """
+    """Return the requirements; FieldError for a gap without a `reference`."""
     if not gate.require:
         return ()
     # Imported here and below: no flight waits for statistics and figures to be loaded.

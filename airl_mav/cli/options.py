@@ -185,10 +185,7 @@ def _with_new_names(words: Sequence[str], renamed: Mapping[str, tuple[str, ...]]
 
 
 def _with_values(model: type[BaseModel], words: Sequence[str]) -> list[str]:
-    """Return the words with switches that may be left open spelled out, as tyro wants them.
-
-    --name becomes --name True, and --no-name becomes --name False.
-    """
+    """Return the words with optional switches as tyro expects: --name True, --name False."""
     values: dict[str, list[str]] = {}
     for name, field in model.model_fields.items():
         if field.annotation == (bool | None):
@@ -309,15 +306,7 @@ def run_command(prog: str, module: str, words: Sequence[str] | None = None) -> N
 def carry_out(prog: str, module: str, words: Sequence[str], **more: Any) -> int:
     """Read a command line and run its command; return the exit status.
 
-    Args:
-        prog: Name of the command.
-        module: See `run_command`.
-        words: The command line without the command's name.
-        more: Given to the module's `run`, as `console`.
-
-    Raises:
-        UsageError: The input cannot be used; a message about a field names its option.
-        SystemExit: tyro has printed the help, or what is wrong with the words.
+    `more` goes to the module's `run`. Raises UsageError, naming the option, or tyro's SystemExit.
     """
     if module.rpartition(".")[2] not in LIGHT:
         # Before the import: it would fail for want of them.
@@ -335,10 +324,7 @@ def carry_out(prog: str, module: str, words: Sequence[str], **more: Any) -> int:
 
 
 def _thread_failed(failed: threading.ExceptHookArgs) -> None:
-    """Print what ended a thread, unless it was the machine.
-
-    TensorBoard's thread on a full disk: whoever writes next raises the same error again.
-    """
+    """Print what ended a thread, unless a full disk did: the next writer raises it again."""
     error = failed.exc_value
     if not isinstance(error, OSError) or machine_failure(error) is None:
         threading.__excepthook__(failed)

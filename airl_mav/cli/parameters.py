@@ -57,11 +57,7 @@ OPTIONS = ParametersOptions
 
 
 def run(options: ParametersOptions) -> int:
-    """Write or print the parameters. Returns exit status 0.
-
-    Raises:
-        UsageError: The vehicle's profile lacks what the firmware needs, or there is no such folder.
-    """
+    """Write or print the parameters; return 0."""
     airframe_of, file_of = KINDS[options.firmware]
     airframe = airframe_of(load_vehicle(options.vehicle))
     text = file_of({**airframe.frame, **airframe.settings})

@@ -59,8 +59,8 @@ RENAMED_OPTIONS = {**RENAMED, "--price": ("--price-usd",)}
 def run(options: ProfileOptions, console: Console | None = None) -> int:
     """Measure, print the report, and write the profile.
 
-    Exit status: 0 measured, 1 it broke off, 130 Ctrl-C. Only with 0 is anything written, and with
-    130 where Ctrl-C ended the soak.
+    Returns 0, 1 if it broke off, or 130 after Ctrl-C. Files are written with 0, and with 130 if
+    Ctrl-C ended the soak.
     """
     console = console or new_console()
     if options.level == "sitl":

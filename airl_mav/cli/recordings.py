@@ -9,10 +9,7 @@ from airl_mav.cli.options import check_installed
 
 
 def folder_of(path: Path, ulg: Path | None = None) -> Path:
-    """Return the folder of a run; a black box becomes one, with the vehicle's log where given.
-
-    Raises UsageError where it cannot be read, or what reads it is not installed.
-    """
+    """Return a run's folder, made of a black box and its log if need be, or raise UsageError."""
     if path.suffix != SUFFIX or path.is_dir():
         return path
     check_installed("black-box" if ulg is None else "refit")

@@ -205,12 +205,7 @@ OPTIONS = RenderOptions
 
 
 def run(options: RenderOptions, console: Console | None = None) -> int:
-    """Write the picture or the film. Returns exit status 0.
-
-    Raises:
-        UsageError: An option does not go with the subject, the arena cannot be made, the run not be
-            read, the renderer cannot draw it, or the file not be written there.
-    """
+    """Write the picture or the film; return 0."""
     console = console or new_console()
     path = Path(options.subject)
     filmed = path.is_dir() or path.suffix == SUFFIX
@@ -263,11 +258,7 @@ def _not_asked_for(options: RenderOptions) -> tuple[str, ...]:
 
 
 def _taking(vehicle: str, name: str | None) -> TakingCamera:
-    """Return a camera of a vehicle profile: a further one by name, or the main one.
-
-    Raises:
-        UsageError: There is no such profile, or it has no such camera.
-    """
+    """Return a camera of a vehicle profile, the main one or an additional one by name."""
     profile = load_vehicle(vehicle)
     if name is None:
         return TakingCamera(profile.camera)

@@ -66,11 +66,7 @@ OPTIONS = ReportOptions
 
 
 def run(options: ReportOptions, console: Console | None = None) -> int:
-    """Build the report. Returns exit status 0.
-
-    Raises UsageError for a folder that holds nothing to report or whose arenas cannot be made any
-    more, and for runs that cannot be compared.
-    """
+    """Build the report; return 0."""
     console = console or new_console()
     if not options.runs:
         raise FieldError("runs", accepted="one run folder or more")

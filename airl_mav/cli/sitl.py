@@ -62,10 +62,9 @@ RENAMED_OPTIONS = {**RENAMED, "--lockstep": ("--level", "lockstep")}
 
 
 def run(options: SitlOptions, console: Console | None = None) -> int:
-    """Fly what is left of the episodes and write the report.
+    """Fly the rest of the episodes and write the report.
 
-    Exit status: 0 all episodes flown, 1 an episode was lost too often, 3 to 5 as of the verdict,
-    130 Ctrl-C.
+    Returns 0, 1 if an episode was lost too often, 3 to 5 as of the verdict, 130 after Ctrl-C.
     """
     voice = Voice(options, "airl-sitl", console)
     requirements = requirements_of(options, reference=False)
@@ -87,11 +86,7 @@ def run(options: SitlOptions, console: Console | None = None) -> int:
 def video_of(
     options: SitlOptions, asked: Scenario, say: Callable[[str], None]
 ) -> AbstractContextManager[None]:
-    """Return what shows the camera's video while it lasts, if that is asked for.
-
-    Raises:
-        UsageError: The camera cannot be shown, the address is none, or PyAV is not installed.
-    """
+    """Return a context that shows the camera's video, if requested."""
     if options.video is None:
         return nullcontext()
     check_installed("film")

@@ -43,10 +43,7 @@ OPTIONS = SweepOptions
 
 
 def run(options: SweepOptions, console: Console | None = None) -> int:
-    """Carry out what is left of a sweep, and show what came out.
-
-    Exit status: 0 all trials ended, 1 a trial cannot be carried out, 130 Ctrl-C.
-    """
+    """Run the rest of a sweep and show it; return 0, 1 (a trial failed) or 130 (Ctrl-C)."""
     console = console or new_console()
     config, settings = options.config(), options.executor_settings()
     _check_device(options)

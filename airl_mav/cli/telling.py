@@ -99,16 +99,7 @@ class Voice:
     """How a command speaks. Use as a context manager: bars are drawn in it."""
 
     def __init__(self, options: Telling, command: str, console: Console | None = None) -> None:
-        """Take what was asked for.
-
-        Args:
-            options: For whom it prints.
-            command: As it is called.
-            console: Where to; None is standard output.
-
-        Raises:
-            FieldError: Both kinds of output are asked for.
-        """
+        """Prepare the output of a command; raise FieldError if both kinds are requested."""
         if options.quiet and options.json_lines:
             raise FieldError("quiet", True, problem="accepted: without --json")
         self._out = console or new_console()
@@ -152,16 +143,16 @@ class Voice:
         runs: Mapping[str, LoadedRun] | None = None,
         more: Sequence[str] = (),
     ) -> None:
-        """Say what it came to to those who read no tables.
+        """Write the machine-readable result.
 
         Args:
             exit_status: Of the command.
-            ended: How the work ended: "complete", "interrupted" or "broken off".
-            path: The folder of what was made.
-            verdict: What the flights show.
+            ended: "complete", "interrupted" or "broken off".
+            path: Output folder.
+            verdict: The verdict.
             page: The report.
-            runs: The runs with flights, by name.
-            more: Further lines that are part of the result.
+            runs: Runs with flights, by name.
+            more: Additional lines of the result.
         """
         lines = () if verdict is None else verdict.lines
         if self._json is not None:

@@ -49,10 +49,9 @@ EXTRAS = ("sim", "train")
 def run(
     options: TrainOptions, console: Console | None = None, *, command_line: str | None = None
 ) -> int:
-    """Train, export, and print the result; `command_line` is noted on the card.
+    """Train, export, and print the result; return 0, or 130 after Ctrl-C.
 
-    Returns the exit status: 0 trained to the end, 130 Ctrl-C. Raises UsageError as
-    `airl_mav.training.run.train`.
+    `command_line` is recorded on the card. Raises UsageError as `airl_mav.training.run.train`.
     """
     from airl_mav.envs.delay import injections_of, speed_bound
 

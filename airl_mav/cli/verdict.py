@@ -69,11 +69,7 @@ OPTIONS = VerdictOptions
 
 
 def run(options: VerdictOptions, console: Console | None = None) -> int:
-    """Seek the verdict.
-
-    Exit status: 0 what is required is met, 1 processes or workers were lost, 3 to 5 as of the
-    verdict, 130 Ctrl-C.
-    """
+    """Seek the verdict; return 0, 1 (workers lost), 3 to 5 (verdict) or 130 (Ctrl-C)."""
     voice = Voice(options, "airl verdict", console)
     # Not the field's default: what is given would be added to it.
     asked = options.model_copy(update={"require": options.require or (DEFAULT_REQUIREMENT,)})

@@ -63,10 +63,7 @@ EXTRAS = ("view",)
 
 
 def run(options: ViewOptions, console: Console | None = None) -> int:
-    """Serve the page until Ctrl-C. Returns exit status 0.
-
-    Raises UsageError for a folder that holds no run, a flight that is not there, or a taken port.
-    """
+    """Serve the page until Ctrl-C; return 0."""
     console = console or new_console()
     paths = [options.run] if options.beside is None else [options.run, options.beside]
     found = [run_folders(folder_of(path)) for path in paths]

@@ -29,11 +29,7 @@ class Viewing(ProfileModel):
 
 
 def view_of(options: Viewing) -> ViewRequest | None:
-    """Return how the flights are watched; None: not at all.
-
-    Raises:
-        UsageError: What draws them is not installed, or there is a port without a view.
-    """
+    """Return the requested live view or None; UsageError for missing packages."""
     if not options.view:
         if options.view_port is not None:
             raise FieldError(

@@ -143,11 +143,7 @@ def scenarios() -> Iterator[tuple[str, Scenario]]:
 
 
 def fly_behaviour(only: Sequence[str] = ()) -> Behaviour:
-    """Fly the flights of the fingerprint.
-
-    Args:
-        only: Names of flights; none given: all.
-    """
+    """Fly the flights of the fingerprint, or only some of them, by name."""
     flown: dict[str, Any] = {
         name: sample(_fly(scenario)) for name, scenario in scenarios() if not only or name in only
     }
@@ -217,11 +213,7 @@ def _difference(stored: FlightSample, flown: FlightSample) -> str:
 
 
 def read_behaviour(path: Path) -> Behaviour:
-    """Read the samples that were written down.
-
-    Raises:
-        UsageError: They are missing or damaged, or do not fit the digest beside them.
-    """
+    """Read the stored samples; UsageError if they are missing, damaged or misfit their digest."""
     data = read_json(path, SCHEMA, "behaviour")
     found = validated(Behaviour, {"flights": data.get("flights")}, path)
     if data.get("digest") != found.digest:

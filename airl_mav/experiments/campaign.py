@@ -140,18 +140,17 @@ def run_cell(
     progress: Progress | None = None,
     stop: Stop = never,
 ) -> CampaignRun:
-    """Fly what is left of one evaluation.
+    """Fly the rest of one evaluation; see `run_cells`.
 
     Args:
-        out: Its run folder; None makes `runs/<UTC time>-<name of the cell>`.
+        out: Its run folder; None = `runs/<UTC time>-<name of the cell>`.
         cell: The evaluation.
-        executor: Who flies.
-        progress: Where to say how far it is.
-        stop: Asked several times a second; True ends it all, with what has ended kept.
+        executor: Executor of the flights.
+        progress: Progress display.
+        stop: Polled several times a second; True stops and keeps finished flights.
 
     Raises:
-        UsageError: The folder holds another run; no arena can be made of a seed. What was flown
-            before is kept.
+        UsageError: The folder holds another run, or no arena can be made of a seed.
     """
     return _run({cell.name: out}, [cell], executor, progress or Progress(), stop)
 
@@ -165,19 +164,16 @@ def run_cells(
     stop: Stop = never,
     ended: Callable[[CellRun], None] = lambda _: None,
 ) -> CampaignRun:
-    """Fly what is left of a campaign.
+    """Fly the rest of a campaign; see `run_cell`.
 
     Args:
         store: Its folder.
-        cells: The evaluations, in the order in which they begin; no two have the same name. Those
-            with the same flights share one run folder.
-        executor: Who flies.
-        progress: Where to say how far it is.
-        stop: Asked several times a second; True ends it all, with what has ended kept.
-        ended: Is told of each cell as it is complete, of one that was complete before, too.
-
-    Raises:
-        UsageError: See `run_cell`.
+        cells: Evaluations with different names, in order; those with the same flights share a run
+            folder.
+        executor: Executor of the flights.
+        progress: Progress display.
+        stop: Polled several times a second; True stops and keeps finished flights.
+        ended: Called for each complete cell, also if it was complete before.
     """
     first_of = shared_flights(cells)
     unique = [cell for cell in cells if first_of[cell.name] is cell]

@@ -36,17 +36,15 @@ def degrade(
     out: Path | str | None = None,
     progress: bool = False,
 ) -> ExperimentResult:
-    """Fly policies at growing latencies and say what that costs.
+    """Fly policies at growing latencies and compare the results. Raises as `evaluate`.
 
     Args:
-        scenario: What is flown; its latency and workload are passed over.
-        latencies: Sources of t2, growing; `native`: none injected. The first is the reference.
-        policies: Names or folders; none given: the scenario's.
-        compensated: Whether each policy is flown with compensated latency, too.
-        out: Folder; the same one goes on. None makes `runs/<UTC time>-degradation-...`.
-        progress: Whether to draw bars on standard error.
-
-    Raises what `evaluate` does.
+        scenario: Flight settings; latency and workload are ignored.
+        latencies: Sources of t2, growing, the reference first; `native` = none injected.
+        policies: Names or folders; empty = the scenario's.
+        compensated: Also fly each policy with latency compensation.
+        out: Folder to create or resume; None = `runs/<UTC time>-degradation-...`.
+        progress: Draw progress bars on standard error.
     """
     declared = declare_degradation(scenario, latencies, policies, compensated=compensated)
     return run_and_compare(declared, out, progress=progress)

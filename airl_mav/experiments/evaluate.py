@@ -57,16 +57,16 @@ def evaluate(
     """Fly policies in arenas on the same seeds and compare them in a table.
 
     Args:
-        scenario: All but policy and arena, which are passed over.
+        scenario: Flight settings; policy and arena are ignored.
         policies: Names or folders.
-        arenas: Names or paths; none given: those that the policies were trained in.
-        out: Folder; the same one goes on. None makes `runs/<UTC time>-matrix-...`.
-        progress: Whether to draw bars on standard error.
+        arenas: Names or paths; empty = those of the policies' training.
+        out: Folder to create or resume; None = `runs/<UTC time>-matrix-...`.
+        progress: Draw progress bars on standard error.
 
     Raises:
         UsageError: Something cannot be flown, or `out` holds something else.
-        RehearsalError: It was broken off: processes or workers were lost too often.
-        KeyboardInterrupt: Ctrl-C; what was flown is kept.
+        RehearsalError: Processes or workers were lost too often.
+        KeyboardInterrupt: Ctrl-C; finished flights are kept.
     """
     return run_and_compare(matrix(scenario, policies, arenas), out, progress=progress)
 
@@ -78,11 +78,7 @@ def matrix(
     *,
     each_fault: bool = False,
 ) -> Experiment:
-    """Declare a table of policies x arenas. Raises UsageError as `evaluate`.
-
-    With `each_fault` every policy is flown healthy and with each of the scenario's faults alone,
-    each a row of its own.
-    """
+    """Declare a table of policies by arenas; `each_fault` adds a row per policy and fault."""
     cells = evaluation_cells(scenario, policies, arenas, each_fault=each_fault)
     facts = {field: getattr(scenario, field) for field in SHARED}
     return Experiment("matrix", f"{len(policies)}-policies", facts, cells)
@@ -95,11 +91,7 @@ def evaluation_cells(
     *,
     each_fault: bool = False,
 ) -> tuple[Cell, ...]:
-    """Return an evaluation for each policy in each arena, with `each_fault` for each fault, too.
-
-    Raises:
-        UsageError: A policy or an arena cannot be flown, or two would share a row or a column.
-    """
+    """Return an evaluation per policy and arena, and per fault with `each_fault`, or UsageError."""
     if not policies:
         raise FieldError("policies", accepted="one or more names or folders")
     found = [find_policy(name, trust=scenario.trust) for name in policies]

@@ -73,20 +73,18 @@ class Executor(Protocol):
         lost: Callable[[str], None] = lambda _: None,
         compiling: Heard = lambda _: None,
     ) -> Results[J, R]:
-        """Carry out jobs, each by whoever is free, and yield their results in any order.
+        """Run jobs on free workers and yield their results in any order.
 
         Args:
-            jobs: What is to be done; the next one is taken when a worker is free.
-            start: What a worker is made of.
-            name: What a job is called in messages.
-            stop: Asked several times a second; True ends it all, and jobs under way are given up.
-            lost: Is told, in one line, of each worker that was lost. Its job begins again: results
-                of an attempt that did not end are never yielded.
-            compiling: Is told when this process or one of its workers begins to compile kernels,
-                and when that is over; of workers on other machines it is not known.
+            jobs: The jobs, taken lazily.
+            start: Initializes a worker.
+            name: Returns a job's name for messages.
+            stop: Polled several times a second; True aborts the running jobs.
+            lost: Called with one line per lost worker; its job restarts, without partial results.
+            compiling: Called when local workers begin and end compiling kernels.
 
         Raises:
-            UsageError: A job says that the input cannot be used.
+            UsageError: A job rejects its input.
             WorkerError: A job failed, or its worker was lost `MAX_ATTEMPTS` times.
         """
         ...
@@ -159,11 +157,7 @@ def answer(work: Callable[[], Iterable[R]]) -> list[R] | Failure:
 
 
 def next_attempt(job: str, attempt: int, cause: str, lost: Callable[[str], None]) -> int:
-    """Return the number of the attempt that follows one whose worker was lost, and report it.
-
-    Raises:
-        WorkerError: It was the last one.
-    """
+    """Report a lost worker and return the next attempt's number; WorkerError after the last."""
     if attempt == MAX_ATTEMPTS:
         raise WorkerError(f"{job}: lost {MAX_ATTEMPTS} workers, the last one by {cause}")
     lost(f"a worker was lost by {cause}: {job} begins again")

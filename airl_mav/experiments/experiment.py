@@ -88,13 +88,10 @@ class ExperimentRun:
     def compare(
         self, requirements: Sequence[Requirement] | None = None
     ) -> tuple[Comparison, dict[str, LoadedRun], Path]:
-        """Work the comparison out and write its files.
+        """Write the comparison; return it with its runs by name and the path of its page.
 
         Args:
-            requirements: What is asked of the runs; None: what was last asked of this folder.
-
-        Returns:
-            The comparison, its runs by name, and the path of its page.
+            requirements: Requirements of the runs; None = the folder's last ones.
 
         Raises:
             UsageError: No cell has flights, or the folder cannot be written.
@@ -166,10 +163,7 @@ def entry_of(cell: Cell, folder: str) -> RunEntry:
 def run_and_compare(
     experiment: Experiment, out: Path | str | None, *, progress: bool
 ) -> ExperimentResult:
-    """Fly an experiment to its end and compare its runs: what the functions of the API share.
-
-    Raises what `evaluate` does.
-    """
+    """Fly an experiment and compare its runs, for the API's functions; raises as `evaluate`."""
     with shown(progress) as shows:
         flown = run_experiment(experiment, None if out is None else Path(out), shows)
     raise_unless_complete(flown.ended, flown.problem)
@@ -178,12 +172,12 @@ def run_and_compare(
 
 
 def run_experiment(experiment: Experiment, out: Path | None, progress: Progress) -> ExperimentRun:
-    """Fly what is left of an experiment; Ctrl-C and SIGTERM end it with what has ended kept.
+    """Fly the rest of an experiment; Ctrl-C and SIGTERM stop it and keep finished flights.
 
     Args:
-        experiment: What is flown.
-        out: Its folder; the same one goes on. None: a new one.
-        progress: Who looks on.
+        experiment: The experiment.
+        out: Folder to create or resume; None = a new one.
+        progress: Progress display.
 
     Raises:
         UsageError: The folder holds something else, or a cell cannot be flown.

@@ -67,18 +67,11 @@ class FaultFlight:
 
 
 def fly_fault(vehicle: VehicleProfile, fault: str, phase: Phase, seed: int) -> FaultFlight:
-    """Fly to 5 m, hold, fly north in offboard or by a mission, land; something fails on the way.
+    """Fly to 5 m, hold, fly north in offboard or by a mission, and land, with a fault on the way.
 
-    The same arguments give the same flight. Arming is asked for; the flight controller's own
-    decisions stand: a pilot who sees another mode than the one asked for leaves it alone, and
-    commands to land after `OPERATOR_S`. The plant is the compiled one: there is nothing to hit but
-    the floor, and a whole matrix takes four fifths of the time that it takes on pybullet.
-
-    Args:
-        vehicle: What flies, on an endless floor.
-        fault: In words, without a time.
-        phase: When it begins.
-        seed: Of sensors, wind and the fault.
+    The result is deterministic. The simulated pilot leaves unexpected modes alone and commands to
+    land after `OPERATOR_S`. The compiled plant suffices, with the floor as the only obstacle, and
+    takes 80 % of pybullet's time. The fault is text without a time; it begins with the phase.
     """
     words = Fault.model_validate(fault).model_copy(update={"phase": phase, "at_s": AFTER_S})
     setup = EpisodeSetup(vehicle, None, seed, Aircraft(faults=(words,), plant="kernel"))
@@ -289,16 +282,16 @@ def fly_matrix(
     known: Sequence[Cell] = (),
     flown: Callable[[Cell], None] = lambda _: None,
 ) -> list[Cell]:
-    """Fly every fault in every phase with every seed; the same arguments give the same cells.
+    """Fly every fault in every phase with every seed; deterministic.
 
     Args:
-        vehicle: What flies.
-        faults: In words, without a time.
-        phases: When they begin.
-        seeds: Of the flights.
-        workers: Processes that fly; they change no result.
-        known: Cells that have been flown; those with these seeds are not flown again.
-        flown: Is told each cell in its order, those that were known too.
+        vehicle: The vehicle.
+        faults: Faults as text, without a time.
+        phases: Phases in which they begin.
+        seeds: Seeds of the flights.
+        workers: Number of processes.
+        known: Cells to reuse if they have the same seeds.
+        flown: Called with each cell in order, also with known ones.
     """
     kept = {
         (cell.fault, cell.phase): cell
@@ -410,10 +403,10 @@ def load(path: Path) -> Matrix:
 
 
 def resumed(path: Path, made: Mapping[str, Any], vehicle: str) -> Matrix:
-    """Return the matrix that goes on in a file: what a stopped one has flown, else nothing yet.
+    """Return the matrix of a stopped run in a file, or an empty one.
 
     Raises:
-        UsageError: Another vehicle, or another version of this package, has flown there.
+        UsageError: The file is of another vehicle or package version.
     """
     if not path.exists():
         return Matrix(dict(made), vehicle, ())

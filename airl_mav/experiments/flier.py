@@ -16,19 +16,9 @@ class Flier(Protocol):
     """How the episodes of a scenario are flown. Goes to workers by pickle."""
 
     def episodes_per_job(self, episodes: int, workers: int) -> int:
-        """Return how many episodes make a job, for an executor that does not stream results.
-
-        Args:
-            episodes: Number of those that are left.
-            workers: Number of jobs at a time.
-        """
+        """Return the episodes per job for executors that do not stream results."""
         ...
 
     def start(self, folder: RunFolder, stop: Stop) -> FlyEpisodes:
-        """Load everything once; return what flies episodes.
-
-        Args:
-            folder: Where logs go.
-            stop: Whether to leave flights unfinished; to be asked while several fly at a time.
-        """
+        """Load everything once; return a function that flies episodes and polls `stop`."""
         ...

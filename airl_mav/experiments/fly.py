@@ -36,16 +36,10 @@ def fly_scenario(
     *,
     executor: Executor | None = None,
 ) -> FlownRun:
-    """Fly what is left of a scenario at any level, several flights at a time where that can be.
+    """Fly the rest of a scenario at any level, several flights at a time if possible.
 
-    Ctrl-C and SIGTERM end it with what has ended kept; all else as of `live.fly_live`.
-
-    Args:
-        scenario: What is flown.
-        out: Run folder; see there.
-        progress: Who looks on.
-        executor: Who flies, of `workers_of`, where several scenarios share workers; None: this one
-            gets its own.
+    Ctrl-C and SIGTERM stop it and keep finished flights; otherwise as `live.fly_live`. `executor`
+    is one that scenarios share; None = a new one.
     """
     asked = scenario.scenario
     name = run_name(scenario)
@@ -68,19 +62,17 @@ def run_name(scenario: ResolvedScenario) -> str:
 
 
 def rehearse(scenario: Scenario, *, out: Path | str | None = None, progress: bool = False) -> Run:
-    """Fly a scenario and return the run.
-
-    A run that was interrupted goes on with the same `out`; what is there is not flown again.
+    """Fly a scenario and return the run; the same `out` resumes an interrupted one.
 
     Args:
-        scenario: What is asked for.
-        out: Run folder; None makes `runs/<UTC time>-...`.
-        progress: Whether to draw a bar on standard error.
+        scenario: The scenario.
+        out: Run folder; None = `runs/<UTC time>-...`.
+        progress: Draw a progress bar on standard error.
 
     Raises:
         UsageError: The scenario cannot be flown, or `out` holds another run.
-        RehearsalError: The run was broken off: processes or workers were lost too often.
-        KeyboardInterrupt: Ctrl-C; what was flown is kept in `out`.
+        RehearsalError: Processes or workers were lost too often.
+        KeyboardInterrupt: Ctrl-C; finished flights are kept in `out`.
     """
     with shown(progress) as shows:
         flown = fly_scenario(resolve(scenario), None if out is None else Path(out), shows)

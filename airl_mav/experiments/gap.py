@@ -81,25 +81,22 @@ def gap(
     out: Path | str | None = None,
     progress: bool = False,
 ) -> ExperimentResult:
-    """Measure what a policy loses on an onboard computer, without mitigation and with it.
+    """Measure a policy's loss on an onboard computer, with and without mitigation.
 
-    Always the same seeds: the policy on the reference computer and on the onboard computer; there
-    with its latency compensated in flight, and with pipelined decisions, too; a policy that was
-    trained as late as that computer decides, there, compensated, under the conditions of its
-    training, and on the reference.
+    On the same seeds: the policy on the reference and on the onboard computer, there also with
+    latency compensation and with pipelined decisions; and a policy trained with that latency,
+    there, compensated, under its training conditions, and on the reference. Raises as `evaluate`.
 
     Args:
-        scenario: Policy, onboard computer with its workload or latency (none given: the paper's
-            network on its Raspberry Pi 4), and how it is flown.
+        scenario: Policy, onboard computer with workload or latency (default: the paper's network on
+            its Raspberry Pi 4), and flight settings.
         mitigated: Name or folder of the mitigated policy, or `none`.
-        reference: Computer profile that the gap is measured from.
-        reference_workload: Workload of the reference; None: the same as the target's if the
-            reference has it, otherwise what was measured there for the very policy.
-        arenas: Arena profiles, each with tables of its own; none given: the scenario's.
-        out: Folder; the same one goes on. None makes `runs/<UTC time>-gap-...`.
-        progress: Whether to draw bars on standard error.
-
-    Raises what `evaluate` does.
+        reference: Reference computer profile.
+        reference_workload: Workload of the reference; None = the target's if the reference has it,
+            otherwise the measurement of the same policy.
+        arenas: Arena profiles, with a table each; empty = the scenario's.
+        out: Folder to create or resume; None = `runs/<UTC time>-gap-...`.
+        progress: Draw progress bars on standard error.
     """
     declared = declare_gap(
         scenario,
@@ -243,10 +240,7 @@ def _reference(computer: str, workload: str | None, target: Conditions) -> Condi
 def _training(
     mitigated: PolicyInfo | None, target: Conditions
 ) -> tuple[tuple[Conditions, ...], tuple[str, ...]]:
-    """Return the conditions that a policy was trained in, one a source of latency, and remarks.
-
-    The computer is the target's: it decides what its watts cost, and nothing else.
-    """
+    """Return a policy's training conditions per latency source, and remarks."""
     if mitigated is None:
         return (), ()
     environment = None if mitigated.card is None else training_environment(mitigated.card)

@@ -107,16 +107,16 @@ def navigation_of(
     trace: Trace | None = None,
     compensator: Compensator | None = None,
 ) -> Navigation:
-    """Return the batch twin that flies a scenario.
+    """Return the vectorized simulator of a scenario, `slots` flights at a time.
 
     Args:
-        scenario: What is flown.
+        scenario: The scenario.
         slots: Flights at a time.
-        trace: Records them.
-        compensator: Of so many companions, to fly with another than the vehicle's own.
+        trace: Recorder.
+        compensator: Compensator of `slots` companions; None = the vehicle's.
 
     Raises:
-        UsageError: The twin cannot fly by its rules.
+        UsageError: The simulator does not support the scenario.
     """
     asked = scenario.scenario
     return Navigation(

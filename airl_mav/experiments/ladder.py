@@ -26,16 +26,14 @@ def ladder(
     out: Path | str | None = None,
     progress: bool = False,
 ) -> ExperimentResult:
-    """Fly the same scenario at several levels and say what differs.
+    """Fly the same scenario at several levels and compare the results. Raises as `evaluate`.
 
     Args:
-        scenario: What is flown; its level is passed over.
-        levels: Two or more; the first is the reference of the others.
-        sitl_episodes: Number of episodes at level sitl; None: 10, or all if they are fewer.
-        out: Folder; the same one goes on. None makes `runs/<UTC time>-ladder-...`.
-        progress: Whether to draw bars on standard error.
-
-    Raises what `evaluate` does.
+        scenario: The scenario; its level is ignored.
+        levels: Two or more levels, the reference first.
+        sitl_episodes: Episodes at level sitl; None = 10, or all if fewer.
+        out: Folder to create or resume; None = `runs/<UTC time>-ladder-...`.
+        progress: Draw progress bars on standard error.
     """
     declared = declare_ladder(scenario, levels, sitl_episodes=sitl_episodes)
     return run_and_compare(declared, out, progress=progress)

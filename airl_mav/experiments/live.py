@@ -60,18 +60,18 @@ def fly_live(
     announce: Callable[[], None] = lambda: None,
     view: ViewRequest | None = None,
 ) -> FlownRun:
-    """Fly what is left of a scenario one flight after the other, at level sitl or lockstep.
+    """Fly the rest of a scenario one flight after the other, at level sitl or lockstep.
 
     Args:
-        scenario: What is flown.
-        out: Run folder; one that holds episodes of the same run gets the others. None: a new one.
-        progress: Who looks on.
-        name: Name of a new run; None: after level and policy.
-        announce: Called before the first flight, if there is one.
-        view: Shows the flights in a browser; None: nobody watches.
+        scenario: The scenario.
+        out: Run folder to create or resume; None = a new one.
+        progress: Progress display.
+        name: Name of a new run; None = by level and policy.
+        announce: Called before the first flight.
+        view: Live view in a browser; None = none.
 
     Raises:
-        UsageError: The input cannot be used; what was flown before is kept.
+        UsageError: Invalid input; earlier flights are kept.
     """
     asked = scenario.scenario
     if asked.level == "gym":

@@ -246,10 +246,7 @@ def _environment(values: dict[str, str]) -> Iterator[None]:
 
 @contextmanager
 def _interrupts_blocked() -> Iterator[None]:
-    """Block Ctrl-C for a while: a process started meanwhile never gets it.
-
-    A terminal sends it to all processes; the parent decides what becomes of its workers.
-    """
+    """Block Ctrl-C while starting processes; the parent decides about its workers."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -259,10 +256,7 @@ def _interrupts_blocked() -> Iterator[None]:
 
 @contextmanager
 def _program_hidden() -> Iterator[None]:
-    """Hide the user's program for a while: a process started meanwhile does not run it once more.
-
-    "spawn" would, for functions that live there; ours live in this package.
-    """
+    """Hide the user's program while starting processes, which "spawn" would run again."""
     program = sys.modules["__main__"]
     sys.modules["__main__"] = ModuleType("__main__")
     try:
@@ -333,10 +327,7 @@ def _end_with_parent() -> None:
 
 
 def side_by_side(settings: Workers) -> int:
-    """Return how many flights of a scenario may be flown at a time: each of PX4's is an instance.
-
-    The user starts one PX4 after the other, if any.
-    """
+    """Return the maximum of parallel flights; the user starts PX4's instances."""
     if not isinstance(settings, Aircraft) or settings.firmware == "builtin":
         return GREATEST_WORKERS
     real = settings.real
@@ -345,14 +336,14 @@ def side_by_side(settings: Workers) -> int:
 
 @contextmanager
 def open_executor(settings: Workers, *, in_process: bool = False) -> Iterator[Executor]:
-    """Give the executor that was asked for.
+    """Open the executor of the settings.
 
     Args:
-        settings: What was asked for; without settings of its own no job takes a GPU.
-        in_process: Whether one worker may be this process; one is then the default, too.
+        settings: Workers; by default no job takes a GPU.
+        in_process: One worker may be this process, and is by default.
 
     Raises:
-        UsageError: Ray is not installed, or not to be reached; too many workers for the firmware.
+        UsageError: Ray is missing or unreachable, or too many workers for the firmware.
     """
     cores = min(usable_cores(), GREATEST_WORKERS)
     if settings.executor == "ray":

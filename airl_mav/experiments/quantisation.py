@@ -65,17 +65,10 @@ class _Witness:
 
 
 def frames_of(folder: Path, *, flights: int = FLIGHTS) -> tuple[Encoded, str, int]:
-    """Fly a policy in the arena of its training, on seeds that no evaluation uses.
-
-    Args:
-        folder: The policy.
-        flights: Number of flights, in the batch twin.
+    """Fly a policy in its training arena on seeds that no evaluation uses.
 
     Returns:
-        All that its network saw, (n, ...) each; the arena; the last seed.
-
-    Raises:
-        UsageError: The policy cannot be flown there.
+        The network's inputs, (n, ...) each; the arena; the last seed.
     """
     card = load_card(folder)
     arena = card.training.arena or DEFAULT_ARENA
@@ -106,19 +99,17 @@ def frames_of(folder: Path, *, flights: int = FLIGHTS) -> tuple[Encoded, str, in
 def export_int8(
     source: Path, out: Path, *, name: str | None = None, flights: int = FLIGHTS
 ) -> PolicyCard:
-    """Write a policy in 8-bit integers, with its card, and return the card.
-
-    The results of the policy in floats are not its own: the card has none until it is evaluated.
+    """Write a policy in 8-bit integers with its card, without the float policy's results.
 
     Args:
-        source: Folder of the policy in floats.
-        out: Folder to write policy.onnx and card.json to; made if need be.
-        name: Short name of the policy; None: that of the source with `-int8`.
-        flights: Number of flights that the frames are drawn from.
+        source: Folder of the float policy.
+        out: Folder for policy.onnx and card.json.
+        name: Short name; None = the source's with `-int8`.
+        flights: Flights that provide the calibration frames.
 
     Raises:
-        UsageError: The policy is one in integers already, cannot be flown or quantised, or `out`
-            is the source or cannot be written. Nothing usable was written then.
+        UsageError: Not a float policy, cannot be flown or quantised, or `out` is the source or not
+            writable.
     """
     card = load_card(source)
     if card.quantisation is not None:

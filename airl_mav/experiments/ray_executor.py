@@ -145,12 +145,7 @@ def _check_reachable(address: str) -> None:
 
 @contextmanager
 def connected(settings: Workers, cores: int, gpus: float) -> Iterator[RayExecutor]:
-    """Be connected to a Ray for a while.
-
-    Args:
-        settings: Its address, and how much of it may be used.
-        cores: Usable cores of this machine.
-        gpus: Share of a GPU that Ray keeps for a job.
+    """Connect to the Ray of the settings; `gpus` is the share of a GPU per job.
 
     Raises:
         UsageError: Ray is not installed, or there is none at that address.

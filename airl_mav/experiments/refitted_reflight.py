@@ -76,27 +76,23 @@ def refly_parts(
     trust: bool = False,
     progress: bool = False,
 ) -> tuple[Reflight, tuple[PartFlown, ...]]:
-    """Rehearse a recorded flight with all of a refit, with each part of it, and with nothing.
+    """Rehearse a recorded flight with a whole refit, each part of it, and none, on equal seeds.
 
-    All fly the same seeds. What a part alone takes of the difference to the flight is what that
-    part explains; the parts need not add up.
+    The change made by one part alone is what it explains; the parts need not add up.
 
     Args:
         path: The black box.
         out: New folder: as of `refly`, and `parts` with the rest.
-        folder: Of the refit.
+        folder: Folder of the refit.
         arena: See `refly`.
         arena_seed: See `refly`.
         episodes: Rehearsals of each.
         policy: See `refly`.
         trust: See `refly`.
-        progress: Whether to draw a bar on standard error.
+        progress: Draw a progress bar on standard error.
 
     Returns:
-        The rehearsals with all of it, and the figures of each part.
-
-    Raises:
-        UsageError: As `refly`; the folder holds no refit.
+        The rehearsals with the whole refit, and the figures of each part.
     """
     everything, base = changes_of(folder), _read(folder).vehicle
     nothing = Changes(vehicle=base, prompt=True)

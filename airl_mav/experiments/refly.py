@@ -117,30 +117,27 @@ def refly(
     changes: Changes = AS_FLOWN,
     progress: bool = False,
 ) -> Reflight:
-    """Rehearse a recorded flight, several times.
+    """Rehearse a recorded flight several times.
 
-    A policy that chooses among actions turns centimetres into another way around a tree: the same
-    flight, flown twice, is not the same. So the rehearsals differ as flights do, by the noise of
-    their sensors, and the flight is held against all of them.
-
-    Without an arena its rehearsal flies over an empty plain, and both paths are given from where
-    navigation began, with the nose north then. In an arena, which the flight was in, nothing is
-    moved.
+    Discrete decisions amplify centimetres into another way around a tree, so that flights differ by
+    sensor noise; the recorded flight is compared with all rehearsals. Without an arena they fly
+    over an empty plain, and both paths start at the origin, heading north. An arena, which the
+    flight was in, keeps its frame.
 
     Args:
         path: The black box.
-        out: New folder; the two run folders `flown` and `rehearsed` come into it.
+        out: New folder for the run folders `flown` and `rehearsed`.
         arena: Arena profile: a shipped name, or a path.
-        arena_seed: Its seed; None: that of the flight.
-        episodes: Number of rehearsals, each with sensors of its own.
-        policy: Policy to rehearse; None: the one that flew, by the name that it had then.
+        arena_seed: Its seed; None = the flight's.
+        episodes: Number of rehearsals, with different sensor noise.
+        policy: Policy to rehearse; None = the recorded one, by its name.
         trust: See `Scenario.trust`.
-        changes: What they have otherwise than the flight's settings say.
-        progress: Whether to draw a bar on standard error.
+        changes: Changes to the flight's settings.
+        progress: Draw a progress bar on standard error.
 
     Raises:
-        UsageError: The recording holds no navigation, its settings are none that can be rehearsed,
-            or the folder holds something. `FieldError`s name the field.
+        UsageError: No navigation or unusable settings in the recording, or `out` holds something.
+            `FieldError`s name the field.
     """
     box = read_black_box(path)
     episode, info = episode_of(box), info_of(box)
@@ -193,10 +190,7 @@ def refly(
 
 
 def from_its_start(episode: FlownEpisode) -> FlownEpisode:
-    """Return a flight as if navigation had begun over the origin, with the nose north.
-
-    Heights stay.
-    """
+    """Return a flight moved to start navigation at the origin, heading north; heights stay."""
     path, record = episode.trajectory, episode.record
     origin = path.position[_begun(episode)] * (1.0, 1.0, 0.0)
     turn = Rotation.from_euler("z", -_first_yaw(episode))

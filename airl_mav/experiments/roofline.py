@@ -107,16 +107,16 @@ class RooflineResult:
 def roofline(
     request: RooflineRequest | None = None, *, out: Path | str | None = None, **knobs: Any
 ) -> RooflineResult:
-    """Work out and fly the roofline of a vehicle.
+    """Compute and fly the roofline of a vehicle.
 
     Args:
-        request: What is asked; None: made of the keywords, its fields.
-        out: Folder; None makes `runs/<UTC time>-roofline-<vehicle>`.
+        request: The request; None = made of `knobs`.
+        out: Folder; None = `runs/<UTC time>-roofline-<vehicle>`.
         knobs: Fields of the request.
 
     Raises:
-        UsageError: The input cannot be used, no computer has the latency, or the folder cannot be
-            written. `FieldError`s name the field.
+        UsageError: Invalid input, no computer has the latency, or the folder is not writable.
+            `FieldError`s name the field.
     """
     request = request or validated(RooflineRequest, knobs)
     stem = Path(request.vehicle).stem

@@ -42,11 +42,7 @@ class Run:
 
     @cached_property
     def latency(self) -> dict[str, Samples]:
-        """Durations (n,) [µs] of each stage over all decisions, by its key.
-
-        `t1`, `t2`, `t3`, `link`, `control`, `end_to_end`, `period` and more; see
-        `latency.stages.STAGES`.
-        """
+        """Durations (n,) [µs] by stage over all decisions; keys as in `latency.stages.STAGES`."""
         return pool(stage_samples(stamps) for stamps in self.stamps.values())
 
     @property
@@ -61,10 +57,7 @@ class Run:
 
     @property
     def sha256(self) -> str | None:
-        """Fingerprint of all flights at level lockstep: the same when they are, bit by bit.
-
-        None at the other levels, whose flights carry none.
-        """
+        """Fingerprint of all lockstep flights, equal if bit-identical; None at other levels."""
         return run_sha256(self.episodes)
 
     @property
@@ -79,11 +72,7 @@ class Run:
         return run_html(self._loaded)
 
     def report(self) -> Path:
-        """Write the page and pictures of the run; return the page.
-
-        Raises:
-            UsageError: No episode was finished, or a profile of the run cannot be found any more.
-        """
+        """Write the page and pictures of the run and return the page, or raise UsageError."""
         # Here: matplotlib is half a second that a run without a page need not wait for.
         from airl_mav.report.run_report import write_report
 
@@ -91,11 +80,7 @@ class Run:
 
 
 def load_run(path: Path | str) -> Run:
-    """Read a run folder.
-
-    Raises:
-        UsageError: The folder holds no run, or a file of it cannot be read.
-    """
+    """Read a run folder; raise UsageError if it holds no run or is damaged."""
     run = Run(Path(path))
     _ = run.info  # What is wrong with the folder is found now.
     return run

@@ -101,21 +101,18 @@ def open_campaign(
     growing: Collection[str] = (),
     say: Callable[[str], None] = lambda _: None,
 ) -> Iterator[CampaignStore]:
-    """Keep the folder of a campaign, new or to be gone on with, to this process.
-
-    Cells may be added to a campaign, and others left for later.
+    """Open and lock a campaign's folder, new or to resume; cells may be added or left for later.
 
     Args:
-        path: The folder; made when there is none.
-        declaration: What is asked for.
+        path: The folder.
+        declaration: The campaign.
         command: The command line, for a new campaign.
-        free: Settings that may differ when it goes on, a table of them by its name.
-        growing: Numbers among the cells' settings that may be greater when it goes on.
-        say: Is told when another process has the folder.
+        free: Settings that may differ on resumption, or names of tables of them.
+        growing: Numeric cell settings that may grow on resumption.
+        say: Called when another process has the folder.
 
     Raises:
-        UsageError: It holds something else or a campaign with other settings, or another process
-            works in it.
+        UsageError: Other content or settings, or another process works in it.
     """
     path = path.absolute()
     with locked(path, say):

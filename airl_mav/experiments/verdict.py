@@ -65,12 +65,12 @@ def seek_verdict(
     """Fly a policy on its onboard computer until its success rate is decided, then the reference.
 
     Args:
-        scenario: The policy and how it is flown; `episodes` is the greatest number of flights.
-        requirements: What is asked. At least one is a least success rate.
-        reference: Computer profile whose flights, of the same seeds, the others are compared with.
+        scenario: Policy and flight settings; `episodes` is the maximum number of flights.
+        requirements: Requirements, with at least one minimum success rate.
+        reference: Reference computer profile, flown on the same seeds.
         reference_workload: As of `declare_gap`.
-        out: Folder; the same one goes on. None makes `runs/<UTC time>-verdict-...`.
-        progress: Who looks on.
+        out: Folder to create or resume; None = `runs/<UTC time>-verdict-...`.
+        progress: Progress display.
 
     Raises:
         UsageError: It cannot be flown, or the folder holds another verdict's flights.
@@ -129,10 +129,7 @@ def _planned(run: Path) -> int:
 
 
 def _looks(most: int, planned: int) -> list[int]:
-    """Return the numbers of flights to look at: a run that was begun goes on where it was.
-
-    Raises FieldError if the greatest number is below the first look.
-    """
+    """Return the flight counts of interim analyses; FieldError if `most` is below the first."""
     if most < LOOKS[0]:
         raise FieldError("episodes", most, f"value >= {LOOKS[0]}, the first look")
     return [look for look in LOOKS if planned <= look <= max(most, planned)] or [planned]

@@ -40,8 +40,7 @@ def make_model(
     """Build a learner with fresh weights; makes torch use one thread.
 
     Raises:
-        UsageError: Unknown algorithm or option, a field that the algorithm does not have, a value
-            that it does not take, or actions that it cannot choose.
+        UsageError: Unknown algorithm or option, unsupported field or value, or unsupported actions.
     """
     # More threads than free cores make the small matrices here 5 to 10 times slower.
     torch.set_num_threads(1)

@@ -108,11 +108,7 @@ def collect(model: BaseAlgorithm) -> tuple[dict[str, Any], Arrays, dict[str, Any
 def restore(
     model: BaseAlgorithm, weights: dict[str, Any], arrays: Arrays, state: dict[str, Any]
 ) -> None:
-    """Restore what `collect` returned.
-
-    Raises:
-        KeyError, RuntimeError, ValueError: It is of a learner of another specification.
-    """
+    """Restore what `collect` returned; KeyError, RuntimeError or ValueError if it does not fit."""
     model.set_parameters(weights["states"], exact_match=True, device=model.device)
     for name in _variables(model):
         attrgetter(name)(model).data.copy_(weights["variables"][name])
@@ -241,15 +237,12 @@ class DamagedError(Exception):
 
 
 def save_checkpoint(folder: Path, model: BaseAlgorithm, meta: Mapping[str, Any]) -> Path:
-    """Write a checkpoint; keep the one before it, remove those before that.
+    """Write a checkpoint and return its folder; only the previous one is kept.
 
     Args:
-        folder: The folder of all checkpoints of the run.
-        model: The learner, between two rollouts; its environment is `Restorable`.
-        meta: What the caller wants back from `load_latest`; JSON.
-
-    Returns:
-        The folder of this checkpoint.
+        folder: Folder of the run's checkpoints.
+        model: The learner between two rollouts; its environment is `Restorable`.
+        meta: JSON data for `load_latest`.
     """
     folder.mkdir(parents=True, exist_ok=True)
     for leftover in folder.glob(f"{PREFIX}*{PARTIAL}"):
@@ -293,20 +286,20 @@ def _write(partial: Path, model: BaseAlgorithm, meta: Mapping[str, Any]) -> None
 def load_latest(
     folder: Path, model: BaseAlgorithm, refused: Callable[[str], None] = warnings.warn
 ) -> dict[str, Any] | None:
-    """Restore a learner and its environment from the newest whole checkpoint.
+    """Restore a learner and its environment from the newest undamaged checkpoint.
 
     Continue with `model.learn(total - model.num_timesteps, reset_num_timesteps=False)`.
 
     Args:
-        folder: The folder of all checkpoints of the run.
-        model: A learner made from the same specification.
-        refused: Called with one line per damaged checkpoint that is skipped.
+        folder: Folder of the run's checkpoints.
+        model: A learner of the same specification.
+        refused: Called with one line per damaged checkpoint.
 
     Returns:
-        The caller's `meta`; None when there is no checkpoint yet.
+        The saved `meta`; None without a checkpoint.
 
     Raises:
-        UsageError: All are damaged, or they are of another specification.
+        UsageError: All are damaged, or of another specification.
     """
     damaged: list[Path] = []
     for path in _candidates(folder):

@@ -164,9 +164,9 @@ class AlgorithmSpec(ProfileModel):
 
 
 def check_fields(spec: AlgorithmSpec) -> None:
-    """Raise FieldError for a field that was given and that the algorithm does not have.
+    """Raise FieldError for a given field that the algorithm does not have.
 
-    No validator of the model: what a run has noted of its configuration names every field.
+    Not a validator of the model, because a run's stored configuration contains every field.
     """
     known = ALGORITHMS[spec.name].fields
     for name in sorted(spec.model_fields_set - {"name", "options", "learning_rate_final"}):
@@ -264,17 +264,17 @@ def configured(
     """Return a configuration with some of its values changed.
 
     Args:
-        config: Its values hold where nothing is given.
-        seed: Of weights, exploration and episodes.
+        config: Default values.
+        seed: Seed of weights, exploration and episodes.
         steps: Decisions of all vehicles together.
-        computer: Profile to decide as late as; needs `workload`.
-        workload: Whose t2 is drawn in every decision.
-        latency: Sources of t2 in place of computer and workload.
-        sensing_distance_m: Bounds the speed by the safe velocity [m].
-        initial: Folder of the training run whose best weights are begun with.
+        computer: Profile whose latency applies; needs `workload`.
+        workload: Workload whose t2 is drawn in every decision.
+        latency: Sources of t2 instead of computer and workload.
+        sensing_distance_m: Sensing distance of the safe velocity [m].
+        initial: Training run whose best weights are the initial ones.
 
     Raises:
-        UsageError: A value is out of range, or lacks the other that it needs.
+        UsageError: A value is out of range, or needs another one.
     """
     if computer is not None and workload is None:
         known = ", ".join(load_computer(computer).workloads)

@@ -96,14 +96,9 @@ class NStepReplay:
         dones: NDArray[np.bool_],
         infos: Sequence[Mapping[str, Any]],
     ) -> None:
-        """Store one step of all vehicles.
+        """Store one step of all vehicles; rewards, actions and dones are (vehicles,).
 
-        Args:
-            observations: What they saw before the step.
-            actions: What they did, (vehicles,).
-            rewards: What they got, (vehicles,).
-            dones: Whose episode ended.
-            infos: Of those, `TimeLimit.truncated` and then `terminal_observation` are read.
+        `infos` of ended episodes have `TimeLimit.truncated` and `terminal_observation`.
         """
         row = self.head
         used = self._slots[row]
@@ -165,11 +160,7 @@ class NStepReplay:
         return state
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Restore what `get_state` returned.
-
-        Raises:
-            ValueError: It is of a memory with other shapes.
-        """
+        """Restore what `get_state` returned; ValueError for other shapes."""
         named = self._named_rows()
         for name, array in named.items():
             saved = state[name]

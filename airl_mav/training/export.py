@@ -152,15 +152,15 @@ class _Actor(nn.Module):
 def network_of(
     model: BaseAlgorithm, keys: Sequence[str] = USUAL, learned: VecNormalize | None = None
 ) -> nn.Module:
-    """Return the part of a model that decides, as `export_network` takes it.
+    """Return the deciding part of an SB3 or sb3-contrib model, for `export_network`.
 
     Args:
-        model: Any algorithm of stable-baselines3 or sb3-contrib.
-        keys: Of its layout's arrays, in their order.
-        learned: The VecNormalize around its environment; None: there was none.
+        model: The model.
+        keys: Keys of its layout's arrays, in order.
+        learned: The VecNormalize around its environment; None = none.
 
     Raises:
-        UsageError: The policy is of a kind that is not known.
+        UsageError: The policy's class is not supported.
     """
     policy: Any = model.policy
     keys = tuple(keys)
@@ -218,9 +218,9 @@ def check_spaces(
     actions: ActionSpec,
     normalised: Collection[str] = (),
 ) -> None:
-    """Raise UsageError unless a model takes the arrays of a layout and gives an action set.
+    """Raise UsageError unless a model takes a layout's arrays and gives an action set.
 
-    Those of `normalised` keys have been floats when it saw them.
+    Arrays of `normalised` keys were floats in training.
     """
     seen = model.observation_space
     wanted = {key: (box.shape, box.dtype) for key, box in boxes(spec).items()}
@@ -263,21 +263,17 @@ def check_spaces(
 
 
 def export(asked: ExportRequest, command: str) -> PolicyCard:
-    """Turn the .zip of a stable-baselines3 model, or a plain module, into a policy that flies.
+    """Export the .zip of an SB3 model, or a plain module, as a policy that flies; return its card.
 
-    A .zip holds pickled Python objects, and a module is code: export only those of people you
-    trust.
+    A .zip holds pickled Python objects and a module is code: export only from people you trust.
 
     Args:
-        asked: The model, the folder, and what the card says beyond the network.
-        command: What the card says was the command.
-
-    Returns:
-        The card.
+        asked: Model, folder and card data beyond the network.
+        command: Command line for the card.
 
     Raises:
-        UsageError: The model cannot be loaded, does not fit what is said of it or cannot be
-            exported, or the folder cannot be written. Nothing usable was written then.
+        UsageError: The model cannot be loaded or exported or does not fit its description, or the
+            folder is not writable. Nothing usable was written.
     """
     out = asked.out
     if out.exists() and not out.is_dir():
@@ -321,15 +317,15 @@ def taken_by(model: BaseAlgorithm) -> Taken:
 
 
 def load_module(name: str, weights: Path | None, keys: Sequence[str] = USUAL) -> nn.Module:
-    """Return a module of the user's, in the form that `export_network` takes.
+    """Return a user's module for `export_network`.
 
     Args:
-        name: The module, its class, or a function that makes it, as `core.plugins` names code.
-        weights: Its `state_dict`, as `torch.save` wrote it; None: it comes with its weights.
-        keys: Of its layout's arrays, in their order.
+        name: Module, class or factory, named as in `core.plugins`.
+        weights: Its `state_dict` as of `torch.save`; None = included.
+        keys: Keys of its layout's arrays, in order.
 
     Raises:
-        UsageError: It cannot be made, or the weights are not its.
+        UsageError: It cannot be made, or the weights do not fit.
     """
     found = load_part(MODELS, name)
     try:
@@ -378,12 +374,11 @@ def export_sb3(
     """Write a model as `policy.onnx` with its card, and return the card.
 
     Args:
-        model: Any algorithm of stable-baselines3 or sb3-contrib.
-        facts: What the card says beyond the network.
-        folder: Where to write; made if need be.
-        with_torch: Also write the network as a torch program.
-        learned: The VecNormalize around its environment, which becomes part of the network; None:
-            there was none.
+        model: Any SB3 or sb3-contrib algorithm.
+        facts: Card data beyond the network.
+        folder: Output folder.
+        with_torch: Also write a torch program.
+        learned: The VecNormalize around its environment, exported with the network; None = none.
 
     Raises:
         UsageError: The model's spaces do not fit the facts, or it cannot be exported.
@@ -400,16 +395,9 @@ def export_sb3(
 
 
 def load_sb3(path: Path, algorithm: str) -> BaseAlgorithm:
-    """Load a model from the .zip that its `save` wrote.
+    """Load a model from a saved .zip of an algorithm's class; UsageError if it is not one.
 
     The archive holds pickled Python objects: load only those of people you trust.
-
-    Args:
-        path: The .zip.
-        algorithm: Name of the class that wrote it.
-
-    Raises:
-        UsageError: No such file or algorithm, or the archive is not one of its.
     """
     learner = algorithm_class(algorithm)
     if not path.is_file():
@@ -429,11 +417,7 @@ def load_sb3(path: Path, algorithm: str) -> BaseAlgorithm:
 
 
 def algorithm_class(name: str) -> type[BaseAlgorithm]:
-    """Return an algorithm by the name of its class, in any case.
-
-    Raises:
-        UsageError: There is none (lists those that exist).
-    """
+    """Return an algorithm's class by its name, ignoring case; UsageError lists the known ones."""
     known: dict[str, type[BaseAlgorithm]] = {}
     for library in _LIBRARIES:
         members = inspect.getmembers(importlib.import_module(library), inspect.isclass)

@@ -69,12 +69,9 @@ def normalised_keys(learned: VecNormalize | None) -> tuple[str, ...]:
 
 
 def load_normalisation(path: Path) -> VecNormalize:
-    """Load what the `save` of a VecNormalize wrote.
+    """Load a saved VecNormalize of Dict observations, or raise FieldError.
 
     The file holds pickled Python objects: load only those of people you trust.
-
-    Raises:
-        FieldError: No such file, or it is none, or not one of Dict observations.
     """
     if not path.is_file():
         raise FieldError(FIELD, path, problem="no such file")
@@ -265,11 +262,11 @@ class ExportRequest(BaseModel):
         return names_code(self.model)
 
     def facts(self, command: str, taken: Taken | None = None) -> PolicyFacts:
-        """Return what is said about the policy.
+        """Return the card data.
 
         Args:
-            command: What made it.
-            taken: What the model says of itself, once it is loaded.
+            command: Command line of the export.
+            taken: Data from the loaded model.
 
         Raises:
             UsageError: A field is missing, contradicts another or is out of range.

@@ -84,11 +84,7 @@ class Demonstrations:
         return named | {"head": np.array(self.head)}
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Restore what `get_state` returned.
-
-        Raises:
-            ValueError: It is of a memory with other shapes.
-        """
+        """Restore what `get_state` returned; ValueError for other shapes."""
         for name, array in self._named().items():
             saved = state[name]
             if saved.shape[1:] != array.shape[1:] or len(saved) > len(array):

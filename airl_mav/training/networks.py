@@ -63,11 +63,7 @@ def dense_units(spec: NetworkSpec) -> list[int]:
 
 
 def flat_size(spec: NetworkSpec, height_px: int, width_px: int) -> int:
-    """Return the numbers that the convolutions give for an image.
-
-    Raises:
-        UsageError: The image is too small for them.
-    """
+    """Return the convolutions' output size for an image; UsageError if it is too small."""
     height, width, filters = height_px, width_px, 1
     for filters, kernel, stride, padding in convolutions(spec, height_px):  # noqa: B007
         height = (height + 2 * padding - kernel) // stride + 1
@@ -124,11 +120,7 @@ DepthExtractor = ImageExtractor
 
 
 def policy_arguments(spec: NetworkSpec) -> dict[str, Any]:
-    """Return the `policy_kwargs` with which a MultiInputPolicy builds a network.
-
-    Raises:
-        FieldError: An extractor of the user's cannot be loaded.
-    """
+    """Return the `policy_kwargs` of a MultiInputPolicy; FieldError for a missing extractor."""
     if spec.own:
         return {
             "features_extractor_class": load_part(NETWORKS, spec.kind, _is_extractor),
@@ -149,10 +141,7 @@ def _is_extractor(found: Any) -> bool:
 
 
 def to_channels_last(policy: nn.Module) -> None:
-    """Lay the convolutions' weights out for the CPU's fast kernels; the numbers stay the same.
-
-    Only on a finished policy: orthogonal initialisation cannot view such weights.
-    """
+    """Store a finished policy's convolution weights for the CPU's fast kernels; same values."""
     for module in policy.modules():
         if isinstance(module, nn.Conv2d):
             module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]

@@ -53,15 +53,7 @@ class Layer(NamedTuple):
 
 
 def inspect_network(module: nn.Module, inputs: tuple[torch.Tensor, ...]) -> tuple[list[Layer], int]:
-    """Run a network once and return what took part in the inference.
-
-    Args:
-        module: The network.
-        inputs: Its inputs, with one row each.
-
-    Returns:
-        Its convolutions and dense layers in order, and the weights and biases of all its parts.
-    """
+    """Run a network on single-row inputs; return its layers in order and parameter count."""
     layers: list[Layer] = []
     weights: dict[int, int] = {}
 
@@ -93,14 +85,14 @@ def export_network(
 ) -> PolicyCard:
     """Write a network as `export.export_sb3` does a model, and return its card.
 
-    The network takes the image (`depth`, `rgb` or `grey`; (n, channels, h, w) uint8), `velocity`
-    and `goal` (n, 3) float32, (n, 4) where it is told the goal's height; it returns a score for
-    each discrete action (n, k), or the continuous action (n, 2), in three dimensions (n, 3).
-    Scaling the image is its own business. One with a memory has it as further inputs and outputs,
-    and their shapes in its attribute `state` (`recurrent.RecurrentNetwork`).
+    Inputs are the image (`depth`, `rgb` or `grey`; (n, channels, h, w) uint8), `velocity` and
+    `goal` (n, 3) float32, or (n, 4) with the goal's height. The output is a score per discrete
+    action (n, k), or the continuous action (n, 2), in three dimensions (n, 3). The network scales
+    the image itself. Memory is passed as additional inputs and outputs, with shapes in the
+    attribute `state` (`recurrent.RecurrentNetwork`).
 
-    Nothing is written unless ONNX Runtime gives what torch gives. A kill on the way leaves a policy
-    without a card, or an old card that refuses the new policy: never a card for the wrong one.
+    Nothing is written unless ONNX Runtime and torch agree. After a kill there is no card, or an old
+    card that rejects the new policy: never a card for the wrong one.
 
     Raises:
         UsageError: The network does not fit the facts, cannot be exported, or the export differs.

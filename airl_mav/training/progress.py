@@ -81,10 +81,7 @@ class TrainingBar(TrainingProgress):
 
 
 def _of_training(evaluation: Evaluation) -> str:
-    """Tell the success in training, whose actions are random in part, where it is another matter.
-
-    Who flies well by chance alone does not when the likeliest action is taken each time.
-    """
+    """Return the training success if random actions make it differ from the evaluation."""
     success = evaluation.training_success
     if success is None or success - evaluation.success_rate < FLOWN_BY_CHANCE:
         return ""

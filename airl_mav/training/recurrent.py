@@ -53,10 +53,7 @@ class RecurrentNetwork(nn.Module):
     def __init__(
         self, features: nn.Module, lstm: nn.LSTM, head: nn.Module, image: str = "depth"
     ) -> None:
-        """Take the way from a Dict of observations to features, and from the LSTM to outputs.
-
-        `image` is the key of the image.
-        """
+        """Connect features of Dict observations, with the image's key, LSTM and output head."""
         super().__init__()
         self.image = image
         self.features = features

@@ -52,18 +52,15 @@ from airl_mav.view.ends import ViewEnds
 
 
 def begin_with(model: BaseAlgorithm, run: Path, log_std: float | None = None) -> None:
-    """Give a learner the best weights of a training run; its optimiser begins afresh.
-
-    Weights are all that the networks of a learner hold: the value's and the exploration's too.
+    """Load the best weights of a training run, value and exploration included; reset the optimiser.
 
     Args:
-        model: A learner of the same algorithm, with the same inputs, network and actions.
-        run: Folder of the training run, of which the newest evaluation may still be to come.
-        log_std: Logarithm of the standard deviation of continuous actions to begin with; None:
-            the run's. What an expert has taught knows none.
+        model: A learner of the same algorithm, inputs, network and actions.
+        run: Folder of an evaluated training run.
+        log_std: Initial log standard deviation of continuous actions; None = the run's.
 
     Raises:
-        UsageError: There is no run, it has not been evaluated yet, or its weights do not fit.
+        UsageError: No such run, not evaluated yet, or the weights do not fit.
     """
     folder = TrainingFolder(run)
     learned = folder.about()["config"]["algorithm"]["name"]
@@ -119,22 +116,22 @@ def train(
     """Train a policy to the end and export its best weights.
 
     Args:
-        config: What to train; its fastest action is bounded by the safe velocity, if it asks.
-        out: Folder of the run; made if need be.
+        config: The configuration; the safe velocity may bound its fastest action.
+        out: Folder of the run.
         name: Name of the policy on its card.
-        resume: Continue the run in `out` from its newest checkpoint, if there is one.
+        resume: Resume the run in `out` from its newest checkpoint, if any.
         progress: Receives the progress.
-        device: What learns, as torch calls it.
-        command: What to note on the card as the command that made the policy.
-        view: Where a view shows flights of it; the weights are the same without.
+        device: torch device of the learner.
+        command: Command line for the card.
+        view: Live view; does not change the weights.
 
     Returns:
         The run's folder, the best evaluation and the policy's card.
 
     Raises:
-        UsageError: A profile or the algorithm cannot be used, `out` holds another run, another
-            process trains in it, or the network cannot be exported.
-        KeyboardInterrupt: Ctrl-C; the newest checkpoint stays, and `resume` continues from it.
+        UsageError: Unusable profile or algorithm, `out` is in use or holds another run, or the
+            export fails.
+        KeyboardInterrupt: Ctrl-C; `resume` continues from the newest checkpoint.
     """
     check_fields(config.algorithm)
     config = config.model_copy(update={"environment": bounded(config.environment)})
@@ -155,9 +152,9 @@ def train(
 
 
 def check_trainable(config: TrainingConfig, name: str, device: str = "cpu") -> None:
-    """Raise UsageError where a training could not begin, or its network could not be exported.
+    """Raise UsageError where a training could not begin or its network not be exported.
 
-    What is the user's own is exported once, as nobody has tried it before; that takes seconds.
+    Custom code is exported once as a test, which takes seconds.
     """
     env = environment_of(config)
     check_actions(config.algorithm.name, kind_of(config.environment.actions))
@@ -191,14 +188,11 @@ def fit(
     device: str,
     watcher: Watcher | None = None,
 ) -> Evaluation:
-    """Train to the end in a locked folder, from the newest checkpoint if there is one.
-
-    Returns:
-        The evaluation of the best weights, which lie in `folder.best_model`.
+    """Train in a locked folder from the newest checkpoint; return the best weights' evaluation.
 
     Raises:
-        UsageError: The algorithm does not fit the environment, an arena cannot be made, there are
-            no such weights to begin with.
+        UsageError: The algorithm does not fit the environment, an arena cannot be made, or initial
+            weights are missing.
     """
     check_actions(config.algorithm.name, kind_of(config.environment.actions))
     env = environment_of(config, watcher)

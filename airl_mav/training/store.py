@@ -77,7 +77,7 @@ class TrainingProgress:
 
         Args:
             steps: Decisions of all vehicles so far.
-            success: Share of the last recent episodes that reached the goal; None before one.
+            success: Success rate of the newest episodes; None before the first.
             zone: Open curriculum zone; None without a curriculum.
         """
 
@@ -103,11 +103,7 @@ class TrainingFolder:
     def begin(
         cls, path: Path, config: TrainingConfig, command: str, *, resume: bool
     ) -> TrainingFolder:
-        """Begin a run in a folder that exists, or open the one that it holds.
-
-        Raises:
-            UsageError: It holds a run that is not to be resumed, or has another configuration.
-        """
+        """Begin a run in a folder or open its run; UsageError if it is not to be resumed."""
         folder = cls(path)
         if not folder.begun:
             plain = config.model_dump(mode="json", exclude_none=True)

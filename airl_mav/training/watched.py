@@ -115,13 +115,7 @@ class WatchedTraining(TrainingProgress):
     def __init__(
         self, ends: ViewEnds, environment: EnvironmentSpec, onwards: TrainingProgress
     ) -> None:
-        """Connect to a view.
-
-        Args:
-            ends: Where it is.
-            environment: What is trained in, its fastest action bounded.
-            onwards: Who is told of the progress, too.
-        """
+        """Connect to a view of training in `environment`; `onwards` also receives the progress."""
         self._onwards = onwards
         self._environment = environment
         self._taping: Taped | None = None
@@ -229,12 +223,7 @@ class Reflight:
         self._environment = environment
 
     def moments(self, taped: Taped, began_us: int) -> Iterator[Moment]:
-        """Fly an episode; give what is shown of it in the order of time.
-
-        Args:
-            taped: The episode.
-            began_us: When it begins, for the view [µs]; the moments' own times count from 0.
-        """
+        """Fly a recorded episode; yield its moments by time, `began_us` apart from the view's."""
         navigation, trace = self.navigation, self._trace
         navigation.begin([0], [taped.seed], taped.zone)
         yield from (Moment(0, message) for message in self._beginning(taped, began_us))
@@ -290,10 +279,7 @@ class Reflight:
         return Moment(now_us, Picture(captured_us=began_us + now_us, shape=shape_of(image)), image)
 
     def _as_seen(self, seen: Encoded) -> Image:
-        """Return the network's image that the view shows as the network has it.
-
-        Of depth those are depths [mm]; colours are what they are.
-        """
+        """Return the network's image for the view: depth [mm], or colours."""
         spec = self.navigation.observation
         image = newest_frame(spec, seen)
         if spec.kind != "depth":

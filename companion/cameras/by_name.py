@@ -57,14 +57,12 @@ def open_named_camera(
             "realsense:FILE.bag"; "oak-d" or "oak-d:DEVICE"; "ros2:/TOPIC"; "rosbag:PATH" or
             "rosbag:PATH:/TOPIC"; FILE.py:NAME, MODULE:NAME or the entry point of a driver.
         clock: The companion's, for the stamps.
-        wanted: What images of a driver are made into; an address sends what it sends.
-        whose: Whose camera `wanted` is: "vehicle quad".
-        further: What a driver's further images are made into, by name; those that it does not give
-            are missing in its frames.
+        wanted: Target of a driver's images; an address is used as it is.
+        whose: Owner of `wanted`: "vehicle quad".
+        further: Targets of a driver's additional images, by name.
 
     Raises:
-        FieldError: There is no such camera, it sees too little of what is wanted, or it gives
-            depth where colour is wanted.
+        FieldError: No such camera, it sees too little, or depth instead of colour.
     """
     if "://" in name:
         return open_camera(name, clock)

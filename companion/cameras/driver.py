@@ -34,10 +34,7 @@ OLDEST_US = US_PER_S
 
 
 def plausible_age_us(age_us: int) -> int:
-    """Return the age of an image by its stamp [µs]; 0 where that is of another clock.
-
-    A calendar may have been set since, or the stamp be the camera's own or of a recording.
-    """
+    """Return an image's age by its stamp [µs]; 0 for a stamp of another clock."""
     return age_us if 0 <= age_us <= OLDEST_US else 0
 
 
@@ -83,10 +80,7 @@ class DepthCamera(Protocol):
         ...
 
     def read(self, timeout_s: float) -> DepthImage | None:
-        """Wait for the next image; None when the time is over [s]. Called from one thread.
-
-        May raise anything: the camera then counts as failed.
-        """
+        """Wait for the next image; None after a timeout [s]. Exceptions are camera failures."""
         ...
 
     def close(self) -> None:
@@ -95,10 +89,7 @@ class DepthCamera(Protocol):
 
 
 def missing_between(last: int | None, number: int | None) -> int:
-    """Return how many images are missing between two by their numbers.
-
-    None are where one has no number, or where the numbers begin anew: a recording that is over.
-    """
+    """Return the number of images missing between two; None without numbers or after a restart."""
     if last is None or number is None:
         return 0
     return max(0, number - last - 1)
@@ -115,14 +106,14 @@ class CameraThread:
         fitting: Fitting,
         further: Mapping[str, Fitting] | None = None,
     ) -> None:
-        """Start to read.
+        """Start to read a driver, which `close` closes.
 
         Args:
-            name: What the camera is called in messages.
-            camera: The driver; closed by `close`.
+            name: Name in messages.
+            camera: The driver.
             clock: The companion's, for the stamps.
-            fitting: What makes its images those that the policy was trained with.
-            further: The same of further images, by name; others are left out.
+            fitting: Conversion into the policy's images.
+            further: The same of additional images, by name; others are left out.
         """
         self.failure: str | None = None
         """Why no more images come, once the driver has raised."""

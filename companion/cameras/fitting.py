@@ -102,10 +102,7 @@ class Fitting:
             self._deeper = deeper.astype(np.float32)
 
     def fit(self, depth_mm: NDArray[np.uint16]) -> NDArray[np.uint16]:
-        """Return the wanted image (wanted.height, wanted.width) [mm]; 0 = no return.
-
-        Args:
-            depth_mm: Z16 image (height, width) of the lens [mm]; 0 = no return.
+        """Return the target image (height, width) [mm] of a lens's Z16 image; 0 = no return.
 
         Raises:
             ValueError: An image of another size or type.
@@ -127,10 +124,7 @@ class Fitting:
 def _looked_up(
     lens: Lens, rays: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the rows and columns (h, w) of a lens, rounded, on which rays (3, h, w) fall.
-
-    They are -1 where a ray falls on none: it points to the side, or backwards.
-    """
+    """Return rounded rows and columns (h, w) of a lens for rays (3, h, w); -1 outside."""
     forward, right, down = rays
     ahead = forward > LEAST_FORWARD
     if lens.distortion is None:
@@ -174,10 +168,9 @@ def _places(
     lens_centre: float,
     points: int,
 ) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Return for each point along one axis its nearest pixel of the lens, and whether it has none.
+    """Return the nearest lens pixel of each point along an axis (size x points,), and misses.
 
-    For a pinhole in a pinhole, whose rows and columns are apart from each other. Both (size x
-    points,); where there is none the pixel is one at the edge.
+    For a pinhole in a pinhole, where rows and columns are separable.
     """
     at = (np.arange(size * points) + 0.5) / points - 0.5
     place = np.rint(lens_centre + lens_focal * (at - centre) / focal).astype(np.intp)
@@ -185,14 +178,7 @@ def _places(
 
 
 def check_coverage(name: str, lens: Lens, fitting: Fitting, whose: str) -> None:
-    """Raise FieldError for a camera that does not see what the policy is to see.
-
-    Args:
-        name: What the camera is called.
-        lens: The camera.
-        fitting: Of its images to what is wanted.
-        whose: Whose camera is wanted: "vehicle quad".
-    """
+    """Raise FieldError for a camera that does not cover the policy's field of view."""
     if fitting.coverage >= LEAST_COVERAGE:
         return
     raise FieldError(

@@ -48,12 +48,10 @@ class OakD:
         """Start a pipeline, and wait for its first image, which describes the lens.
 
         Args:
-            name: What the camera is called in messages.
-            pipeline: `depthai.Pipeline` of a device, or of nodes of the host's; stopped by `close`.
-            depth: Its output of depth images (`depthai.Node.Output`): RAW16 [mm], 0 = no return,
-                rectified.
-            now: The host's monotonic time, to which depthai brings the camera's stamps; None: that
-                of depthai's clock.
+            name: Name in messages.
+            pipeline: `depthai.Pipeline` of a device or of host nodes; stopped by `close`.
+            depth: Its rectified depth output (`depthai.Node.Output`): RAW16 [mm], 0 = no return.
+            now: Monotonic host time of depthai's stamps; None: depthai's clock.
 
         Raises:
             FieldError: No image comes, or the first one is without intrinsics or no depth image.
@@ -79,11 +77,7 @@ class OakD:
         return self._lens
 
     def read(self, timeout_s: float) -> DepthImage | None:
-        """Wait for the next image; see `driver.DepthCamera`.
-
-        Raises RuntimeError when none has come for 5 s or the connection is lost, and ValueError for
-        one that holds no depth.
-        """
+        """Wait for the next image; RuntimeError after 5 s or disconnection, else ValueError."""
         frame, self._first = self._first, None
         if frame is None:
             frame = self._taken(timeout_s)
@@ -115,12 +109,9 @@ class OakD:
 
 
 def _lens_of(frame: Any) -> Lens:
-    """Return the lens of an image, as depthai's own nodes take it to make points of depth.
+    """Return the lens of an image as depthai's own point-cloud nodes use it, or raise ValueError.
 
-    It follows the image through rectification and scaling, from the calibration in the device. The
-    distortion that goes with it is that of the sensor's image: there is none after rectification.
-
-    Raises ValueError for an image without intrinsics.
+    Intrinsics follow the image through rectification and scaling; rectified images are undistorted.
     """
     about = frame.getTransformation()
     if not about.isValid():
@@ -144,12 +135,11 @@ def open_oak_d(which: str) -> OakD:
     """Open a camera, and start to match.
 
     Args:
-        which: "" for the first camera; a device id, as `depthai` lists it; or the address of one on
-            the network (PoE), which need not be in the list.
+        which: "" for the first camera; a device id, as `depthai` lists it; or a network address
+            (PoE), which need not be in the list.
 
     Raises:
-        FieldError: There is no such camera, another program has it, it is no stereo camera, or it
-            sends no depth images.
+        FieldError: No such camera, in use, not a stereo camera, or no depth images.
     """
     name = f"oak-d:{which}" if which else "oak-d"
     found = [each.getDeviceId() for each in dai.Device.getAllAvailableDevices()]

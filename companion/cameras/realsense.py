@@ -32,14 +32,9 @@ class RealSense:
     """The depth stream of one device. Implements `driver.DepthCamera`."""
 
     def __init__(self, device: Any, utc_now_us: Callable[[], int] = utc_us) -> None:
-        """Start the depth stream of a device of librealsense's.
+        """Start the depth stream of a `pyrealsense2.device`, or raise FieldError.
 
-        Args:
-            device: `pyrealsense2.device`: a camera, a recording that is played, or a software one.
-            utc_now_us: The host's calendar time [µs], by which librealsense stamps images.
-
-        Raises:
-            FieldError: It has no depth stream.
+        `utc_now_us` is the host's calendar time [µs], by which librealsense stamps images.
         """
         self._device, self._utc_now_us = device, utc_now_us
         self._sensor, profile = _depth_stream(device)
@@ -56,11 +51,7 @@ class RealSense:
         return self._lens
 
     def read(self, timeout_s: float) -> DepthImage | None:
-        """Wait for the next image; see `driver.DepthCamera`.
-
-        Raises RuntimeError when none has come for 5 s: the camera was unplugged, or a recording is
-        over.
-        """
+        """Wait for the next image; RuntimeError after 5 s: unplugged, or a recording is over."""
         arrived, frame = self._queue.try_wait_for_frame(int(timeout_s * US_PER_S / US_PER_MS))
         if not arrived:
             self._silence.lasted(timeout_s)
@@ -87,13 +78,10 @@ class RealSense:
 
 
 def open_realsense(which: str) -> RealSense:
-    """Open a camera, or a recording.
+    """Open a camera or a recording, or raise FieldError.
 
     Args:
         which: "" for the first camera; a serial number; or a path that ends in .bag or .db3.
-
-    Raises:
-        FieldError: There is no such camera or file, or it has no depth stream.
     """
     context = rs.context()
     if which.endswith(RECORDINGS):

@@ -129,14 +129,9 @@ class Ros2Camera:
     """An image topic and its camera_info. Implements `driver.DepthCamera`."""
 
     def __init__(self, topic: str, utc_now_us: Callable[[], int] = utc_us) -> None:
-        """Subscribe, and wait for the camera's description.
+        """Subscribe to depth images, and wait for the camera's description, or raise FieldError.
 
-        Args:
-            topic: Of the depth images, as `ros2 topic list` shows it.
-            utc_now_us: The host's calendar time [µs], by which ROS stamps images.
-
-        Raises:
-            FieldError: Nobody describes the camera, or it is no pinhole.
+        `utc_now_us` is the host's calendar time [µs], by which ROS stamps images.
         """
         self._utc_now_us, self._silence = utc_now_us, Silence()
         self._participant = _participant()
@@ -168,10 +163,7 @@ class Ros2Camera:
         return self._lens
 
     def read(self, timeout_s: float) -> DepthImage | None:
-        """Wait for the next image; see `driver.DepthCamera`.
-
-        Raises RuntimeError when none has come for 5 s, and ValueError for one that holds no depth.
-        """
+        """Wait for the next image; RuntimeError after 5 s, ValueError without depth."""
         message = _next(self._images, timeout_s)
         if message is None:
             self._silence.lasted(timeout_s)
@@ -197,11 +189,7 @@ def _next(reader: DataReader[Any], timeout_s: float) -> Any | None:
 
 
 def _domain() -> int:
-    """Return the number of the domain that ROS 2's nodes here are in.
-
-    Raises:
-        UsageError: ROS_DOMAIN_ID is no such number.
-    """
+    """Return ROS_DOMAIN_ID, or raise UsageError if it is invalid."""
     told = os.environ.get("ROS_DOMAIN_ID") or "0"
     if not told.isdecimal() or int(told) > MOST_DOMAIN:
         raise UsageError(f"ROS_DOMAIN_ID {told}: accepted: a whole number from 0 to {MOST_DOMAIN}")

@@ -28,8 +28,7 @@ MILLIMETRES, METRES = ("16UC1", "mono16"), ("32FC1",)
 def depth_mm(message: Any) -> NDArray[np.uint16]:
     """Return the depth image (height, width) of a sensor_msgs/Image [mm]; 0 = no return.
 
-    Depth is along the optical axis. Of metres, NaN, infinity and what is not positive are no
-    return (ROS Enhancement Proposal 117).
+    In metres, NaN, infinity and non-positive values are no return (ROS Enhancement Proposal 117).
 
     Raises:
         ValueError: The message holds no depth image, or not the bytes that it announces.
@@ -79,10 +78,9 @@ RECTIFIED = "rect"
 def lens_of(message: Any, image_topic: str = "") -> Lens:
     """Return the lens that a sensor_msgs/CameraInfo describes.
 
-    A camera without distortion is described by K. One with distortion is described by P, which
-    holds for its rectified images alone: those are what drivers are asked for. A fisheye's images,
-    of the model `equidistant`, are taken as they are, described by K and D, unless the last part of
-    their topic says that they are rectified.
+    Without distortion K describes the camera. With distortion P does, for the rectified images that
+    drivers subscribe to. Images of the model `equidistant` (fisheye) are used unrectified with K
+    and D, unless the last part of their topic says that they are rectified.
 
     Raises:
         ValueError: It describes neither pinhole nor fisheye, or images that are binned or cropped.

@@ -21,15 +21,7 @@ class RosBag:
     """The depth images of one topic of a recording. Implements `driver.DepthCamera`."""
 
     def __init__(self, which: str, clock: Clock) -> None:
-        """Open a recording.
-
-        Args:
-            which: PATH of its folder (or of an .mcap or .db3 file), or PATH:TOPIC.
-            clock: Tells when the next image is due.
-
-        Raises:
-            FieldError: There is no such recording, it has no such topic, or several.
-        """
+        """Open a recording, PATH of its folder or file, or PATH:TOPIC; else FieldError."""
         path, separator, topic = which.rpartition(":/")
         if not separator:
             path, topic = which, ""
@@ -97,10 +89,7 @@ class RosBag:
         return self._lens
 
     def read(self, timeout_s: float) -> DepthImage | None:
-        """Wait until the next image is due; see `driver.DepthCamera`.
-
-        Raises RuntimeError when the recording is over, and ValueError for an image without depth.
-        """
+        """Wait until the next image is due; RuntimeError at the end, ValueError without depth."""
         if self._next is None:
             self._next = next(self._told, None)
         if self._next is None:

@@ -60,11 +60,7 @@ class Airframe:
 
 
 def px4_airframe(vehicle: VehicleProfile, output: str) -> Airframe:
-    """Return a quad by PX4's control allocation: rotor positions and turns, output functions.
-
-    Args:
-        vehicle: Its rotors, and its section on PX4.
-        output: Parameter of an output's function: SITL_OUTPUT or HITL_OUTPUT.
+    """Return a quad by PX4's control allocation; `output` is SITL_OUTPUT or HITL_OUTPUT.
 
     Raises:
         FirmwareMissingError: The profile has no section on PX4.
@@ -119,10 +115,7 @@ def _px4_problem(motors: Sequence[Corner], output: str, held: Mapping[str, Value
 
 
 def ardupilot_airframe(vehicle: VehicleProfile) -> Airframe:
-    """Return a quad by ArduCopter's frame class and type, and its output functions.
-
-    Raises FirmwareMissingError if the profile has no section on ArduPilot.
-    """
+    """Return a quad by ArduCopter's frame class, type and outputs; else FirmwareMissingError."""
     copter = vehicle.ardupilot
     if copter is None:
         raise _no_table("ardupilot")

@@ -104,15 +104,15 @@ class ExternalFlightStack:
         on_close: Callable[[], None] = lambda: None,
         look_every_us: int = 0,
     ) -> None:
-        """Compose it; nothing is started yet.
+        """Compose the stack without starting it.
 
         Args:
             launcher: Starts the firmware.
             observer: Of its MAVLink.
-            timeout_s: Longest wait for each of its answers during the boot sequence [wall s].
-            on_close: Called when it is closed, to release what belongs to it.
-            look_every_us: What the observer's link has brought is taken no more often in a flight
-                [µs]. Only where nobody waits for the link to become readable.
+            timeout_s: Timeout of each answer during the boot sequence [wall s].
+            on_close: Called when it is closed.
+            look_every_us: Minimum interval of reading the observer's link in flight, where it
+                cannot signal [µs].
         """
         self._on_close = on_close
         self._launcher = launcher
@@ -151,9 +151,7 @@ class ExternalFlightStack:
     def connect(self, tick: Callable[[], int], truth: Callable[[], Truth]) -> None:
         """Run the boot sequence on the ground until the frame is checked and it may be armed.
 
-        Args:
-            tick: Flies a tick and returns its simulated time [µs].
-            truth: Not needed: its simulator interface has it.
+        `tick` flies a tick and returns its simulated time [µs].
 
         Raises:
             FirmwareMissingError: It is silent, has another frame, or never gets ready to arm.

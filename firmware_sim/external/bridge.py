@@ -29,9 +29,9 @@ class Bridge(Protocol):
         """Wait until the firmware has connected.
 
         Args:
-            timeout_s: Longest wait [wall s].
-            alive: Called now and then, also by every later `step` that has to wait; raises when
-                the firmware's process has died.
+            timeout_s: Timeout [wall s].
+            alive: Polled here and by every later `step` that waits; raises when the process has
+                died.
 
         Raises:
             FirmwareMissingError: It did not connect in time.

@@ -52,8 +52,7 @@ def real_firmware(wanted: Wanted) -> ExternalFlightStack:
     """Bind the ports of real firmware and return it, not yet started.
 
     Raises:
-        UsageError: A port is taken, the program is not there, or the vehicle's profile lacks what
-            this firmware needs.
+        UsageError: A port is taken, or program or profile section are missing.
     """
     launcher, endpoint = _PARTS[wanted.aircraft.firmware](wanted)
     observer = Observer(endpoint, "observer", wanted.vehicle.told_origin)
@@ -71,15 +70,9 @@ def _px4(wanted: Wanted) -> tuple[Launcher, Endpoint]:
 def px4_parts(
     wanted: Wanted, instance: int, bridge: Callable[[int], Px4Bridge]
 ) -> tuple[Launcher, Endpoint]:
-    """Bind the observer's end of PX4's payload link; return it, and what starts PX4.
+    """Bind the observer's end of PX4's payload link; return PX4's launcher and that end.
 
-    Args:
-        wanted: What is asked of it.
-        instance: PX4's instance number, which moves its ports.
-        bridge: Opens the simulator interface on a TCP port.
-
-    Raises:
-        UsageError: As of `real_firmware`.
+    `instance` moves the ports; `bridge` opens the simulator interface on one.
     """
     options = wanted.aircraft.real
     airframe = px4_airframe(wanted.vehicle, SITL_OUTPUT)

@@ -48,15 +48,10 @@ class ConductedPx4:
 
 
 def conducted_px4(aircraft: Aircraft, vehicle: VehicleProfile, log: Path | None) -> ConductedPx4:
-    """Bind the ports of an instance of PX4's and return it, not yet started.
+    """Bind the ports of an instance of PX4 and return it, not yet started.
 
-    Where PX4 is started here, that is the first free instance from the one asked for on: flights
-    that run side by side, in processes of their own, each find another one.
-
-    Args:
-        aircraft: What was asked of it.
-        vehicle: What it flies.
-        log: What it prints goes here; None: to a file in its folder.
+    PX4 started here gets the first free instance from the requested one on, so that parallel
+    flights find different ones. `log` takes its output; None: a file in its folder.
 
     Raises:
         UsageError: No instance is free, or the program is not there.

@@ -27,16 +27,15 @@ class Launcher:
         program: Callable[[Path], StartCommand] | None = None,
         folders: WorkingFolders | None = None,
     ) -> None:
-        """Take what is started, and its simulator interface.
+        """Configure the launch.
 
         Args:
-            airframe: What it must be configured to.
+            airframe: Required configuration.
             bridge: Opens the simulator interface for one flight.
-            timeout_s: Longest wait for it to connect [wall s].
-            reboots: Whether it comes up again when told to reboot; otherwise it can only be told
-                to shut down.
-            program: Called with an empty working folder, which it may write files to; returns the
-                command that starts the program there. None = the user starts it.
+            timeout_s: Timeout for connecting [wall s].
+            reboots: Whether it restarts by itself on a reboot command.
+            program: Writes files to an empty working folder and returns the command to run there;
+                None = the user starts it.
             folders: Its working folders and log.
         """
         self.airframe = airframe
@@ -76,10 +75,7 @@ class Launcher:
         return bridge
 
     def _await(self, bridge: Bridge, alive: Callable[[], None]) -> None:
-        """Wait until it has connected.
-
-        Raises FirmwareMissingError, too, when it ends by itself before: it would do so again.
-        """
+        """Wait for the connection; FirmwareMissingError also if the program ends before."""
         try:
             bridge.wait_connected(self._timeout_s, alive)
         except FirmwareLostError as error:

@@ -43,10 +43,7 @@ _IN_AIR = (
 def flight_of(
     autopilot: int, custom_mode: int, landed_state: int, *, armed: bool, ready: bool
 ) -> Flight:
-    """Return phase and mode by the fields of HEARTBEAT and EXTENDED_SYS_STATE.
-
-    `armed`: motors may turn; `ready`: it may be armed.
-    """
+    """Return phase and mode by HEARTBEAT and EXTENDED_SYS_STATE; `ready` = it may be armed."""
     if autopilot == dialect.MAV_AUTOPILOT_ARDUPILOTMEGA:
         mode = _ARDUCOPTER_MODES.get(custom_mode, Mode.POSITION)
         # GUIDED takes off as well: coming from the ground is no flight by setpoints.
@@ -109,13 +106,7 @@ class Observer:
     """One link to external firmware. Nothing blocks, and no received message raises."""
 
     def __init__(self, endpoint: Endpoint, name: str, origin: Geodetic | None = None) -> None:
-        """Take the link to the firmware.
-
-        Args:
-            endpoint: Of the link.
-            name: Its name in the traffic counters.
-            origin: Where it begins, which firmware without GPS is told; None: it knows.
-        """
+        """Observe a named link; `origin` is sent to firmware without GPS."""
         self._endpoint = endpoint
         self._name = name
         self._origin = origin
@@ -157,10 +148,7 @@ class Observer:
 
     @property
     def ready(self) -> bool:
-        """Whether it reports that it may be armed, and sends its position.
-
-        ArduPilot may be armed before it knows its position, but not flown by setpoints.
-        """
+        """Whether it may be armed and sends its position, which ArduPilot needs to be flown."""
         return self._ready and "LOCAL_POSITION_NED" in self._came
 
     def flight(self, *, armed: bool) -> Flight:

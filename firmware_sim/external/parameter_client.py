@@ -72,10 +72,7 @@ class ParameterClient:
         return missing
 
     def set(self, wanted: Mapping[str, Value]) -> list[str]:
-        """Set a burst of those that differ; return the names of all that differ.
-
-        Each must be known already: its type determines the encoding of its value.
-        """
+        """Set those that differ and return their names; known types determine the encoding."""
         differing = [name for name in wanted if not same(self._values[name], wanted[name])]
         if self._target is not None:
             for name in differing[:BURST]:

@@ -18,10 +18,9 @@ def ardupilot_file(settings: Mapping[str, Value]) -> str:
 
 
 def qgroundcontrol_file(settings: Mapping[str, Value]) -> str:
-    """Return a file that QGroundControl loads (Vehicle Setup > Parameters > Tools).
+    """Return a file for QGroundControl (Vehicle Setup > Parameters > Tools), format "Parameters".
 
-    Source: QGroundControl, file format "Parameters": vehicle id, component id, name, value, type,
-    between tabs.
+    Lines hold vehicle id, component id, name, value and type, between tabs.
     """
     head = "# Vehicle-Id Component-Id Name Value Type\n"
     return head + "".join(

@@ -55,13 +55,7 @@ class RunningProgram:
             return False
 
     def settle(self) -> bool:
-        """Return once the threads sleep, having done all that there is to do for now.
-
-        They are looked for at the first call: they must be there by then.
-
-        Returns:
-            Whether they do; False where that cannot be known, or took too long.
-        """
+        """Return once all threads, found at the first call, sleep; False if unknown or too late."""
         patience, looks = Patience(), 0
         while looks < LOOKS:
             asleep = self._all_asleep()
@@ -107,15 +101,9 @@ class RunningProgram:
 
 
 def program_at(host: str, port: int, to_port: int) -> int | None:
-    """Return the process id of whose TCP connection this is; None: not known.
+    """Return the process id of a TCP connection's client, None if unknown or of another user.
 
-    Nobody is found among the processes of other users, nor on other machines.
-
-    Args:
-        host: Its address, as it is seen from here.
-        port: Its port.
-        to_port: The port that it has connected to: its own may be another program's, too, for a
-            connection to somewhere else.
+    `to_port` is the server's port: the client's own may also connect elsewhere.
     """
     with suppress(psutil.Error, OSError):
         for connection in psutil.net_connections("tcp4"):
@@ -149,10 +137,10 @@ class FirmwareProcess(ChildProcess):
     """One process of external firmware; it ends with us, also when we are killed."""
 
     def __init__(self, name: str, command: StartCommand, cwd: Path, log: Path) -> None:
-        """Start it in a folder; what it prints is appended to `log`.
+        """Start a named program in a folder, appending its output to `log`.
 
-        `name` is what it is called in messages: PX4. Raises FirmwareMissingError if the program is
-        not there, or may not be run.
+        Raises:
+            FirmwareMissingError: The program is missing or not executable.
         """
         self.name = name
         program = Path(command.argv[0])
@@ -174,12 +162,12 @@ class WorkingFolders:
     """One working folder after the other; firmware keeps parameters and flight logs there."""
 
     def __init__(self, name: str, kept: Path | None, log: Path | None) -> None:
-        """Choose the place.
+        """Choose the folders of a firmware, such as px4.
 
         Args:
-            name: Name of the firmware: px4.
+            name: Name of the firmware.
             kept: Folder that keeps the working folders; None = temporary ones, one at a time.
-            log: Log of what the process prints; None = a file beside the working folders.
+            log: Log of its output; None = a file beside the working folders.
         """
         self._name = name
         self._flights = 0

@@ -24,9 +24,9 @@ def check_program(real: RealFirmware) -> None:
 
 
 def load_timeout_s(aircraft: Aircraft) -> float | None:
-    """Return the longest wait until the vehicle stands ready [wall s]; None: as for any answer.
+    """Return the start-up timeout [wall s], None = as for any answer.
 
-    To connect, a heartbeat, the parameters read and set, ready to arm: each within the time-out.
+    It covers connection, heartbeat, parameters read and set, and ready to arm, a timeout each.
     """
     if aircraft.firmware == "builtin":
         return None

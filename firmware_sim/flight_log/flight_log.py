@@ -47,8 +47,8 @@ class FlightLog:
         """Open the log; see `UlogWriter`.
 
         Args:
-            path: Its final name; it has another one until it is closed.
-            parameters: Of the vehicle, as they are when the log begins.
+            path: Its final name, given on closing.
+            parameters: Parameters of the vehicle at the start.
             start_us: Simulated time now [µs].
             boot_unix_us: Calendar time of simulated time 0 [µs since 1970].
             on_lost: Called once when it cannot be written any more; see `LogFile`.

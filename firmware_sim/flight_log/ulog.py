@@ -83,9 +83,9 @@ class UlogWriter(LogFile):
         Args:
             path: The log.
             start_us: Simulated time at which the log begins [µs].
-            topics: What can be written by `sample`, by their place in this order.
-            info: Facts of the vehicle by ULog's keys; a number is written as uint32_t.
-            parameters: Every parameter's name and value; an int is written as int32_t.
+            topics: Topics in the order of `sample`'s numbers.
+            info: Facts by ULog keys; numbers are written as uint32_t.
+            parameters: Names and values; an int is written as int32_t.
             on_lost: See `LogFile`.
         """
         super().__init__(path, on_lost)
@@ -108,11 +108,9 @@ class UlogWriter(LogFile):
         """Size of all that stands before the first sample."""
 
     def sample(self, number: int, time_us: int, values: Values) -> None:
-        """Add one sample of topic `number`, taken at simulated `time_us` [µs].
+        """Add a sample of topic `number` at simulated `time_us` [µs]; check its fields.
 
-        A number beyond those of single precision is infinite in the log, as on the aircraft.
-
-        Raises struct.error when the values are not those of the topic's fields.
+        Values beyond single precision become infinite, as on the aircraft.
         """
         layout = self._samples[number]
         self._now_us = time_us

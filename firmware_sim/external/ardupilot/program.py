@@ -39,10 +39,7 @@ class Links:
 
 
 def find_arducopter(path: Path) -> Path:
-    """Return the program of a build or a source tree, or itself.
-
-    Raises FirmwareMissingError when there is none.
-    """
+    """Return the program at or below a path, or raise FirmwareMissingError."""
     if path.is_file():
         return path.resolve()
     for layout in LAYOUTS:
@@ -61,11 +58,7 @@ def simulator_port(instance: int) -> int:
 
 
 def command(program: str, instance: int, links: Links, defaults: str) -> list[str]:
-    """Return program and arguments.
-
-    The instance number moves the simulator's port; `defaults` is a file of default parameters,
-    relative to its working directory.
-    """
+    """Return program and arguments; `instance` moves the port, `defaults` is a relative file."""
     home = f"{HOME.latitude_deg},{HOME.longitude_deg},{HOME.altitude_m},0"
     return [
         program,

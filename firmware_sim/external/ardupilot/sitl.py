@@ -73,12 +73,7 @@ def state_line(time_us: int, sample: SensorSample, truth: Truth) -> bytes:
 
     ArduPilot finds keys by substring and then reads with sscanf: nothing may stand between a key's
     colon and its bracket, and no key may hold the name of a later one. Numbers are the shortest
-    that read back as the same double.
-
-    Args:
-        time_us: Physics time on a base of the sender's own, > 0 [µs].
-        sample: What the inertial sensors measure, FRD.
-        truth: The true state: ArduPilot simulates GPS, barometer and compass from it.
+    that read back as the same double. From `truth` ArduPilot simulates GPS, barometer and compass.
     """
     return (
         f'\n{{"timestamp":{time_us * AWAY_FROM_ZERO / US_PER_S!r},'
@@ -119,10 +114,9 @@ class ArdupilotBridge:
     """One ArduPilot, one episode. Implements `bridge.Bridge`."""
 
     def __init__(self, port: int, *, silence_s: float = SILENCE_S) -> None:
-        """Open a UDP port on the loopback address; nothing is sent before ArduPilot sends a packet.
+        """Open a loopback UDP port, or raise UsageError; ArduPilot sends first.
 
-        `silence_s` is the longest wait for a packet [wall s]. Raises UsageError if the port is
-        taken.
+        `silence_s` is the longest wait for a packet [wall s].
         """
         self.rate_hz = 0
         """What ArduPilot asks for: it arms only with 1.8 times its loop rate (SCHED_LOOP_RATE,
@@ -159,10 +153,7 @@ class ArdupilotBridge:
             ) from error
 
     def wait_connected(self, timeout_s: float, alive: Callable[[], None]) -> None:
-        """Wait for the first servo packet; ArduPilot waits for our answer from then on.
-
-        See `Bridge`. Raises FirmwareMissingError also when it asks for an invalid rate.
-        """
+        """Wait for the first servo packet, see `Bridge`; FirmwareMissingError for a bad rate."""
         self._alive = alive
         stopwatch = WallClock()
         while self._packet is None:
@@ -184,8 +175,8 @@ class ArdupilotBridge:
     def step(self, sample: SensorSample) -> ActuatorControls:
         """Answer the pending packet, and return the motor commands of the next one; see `Bridge`.
 
-        The motors are outputs 1 to 4 in this order. ArduCopter's quad X (FRAME_TYPE 1) numbers
-        them as PX4 does: front right, rear left, front left, rear right.
+        Outputs 1 to 4 of ArduCopter's quad X (FRAME_TYPE 1) are PX4's motors: front right, rear
+        left, front left, rear right.
         """
         answered, truth, address = self._packet, self._truth, self._address
         if answered is None or truth is None or address is None:
@@ -207,10 +198,7 @@ class ArdupilotBridge:
         self._socket.close()
 
     def _newest(self, packet: ServoPacket) -> ServoPacket:
-        """Return the newest of the packets that arrived since the last step.
-
-        All of them get one answer: an extra line would put ArduPilot a frame ahead for good.
-        """
+        """Return the newest packet since the last step: extra answers would put ArduPilot ahead."""
         self._socket.settimeout(0.0)
         try:
             while True:
@@ -246,10 +234,7 @@ class ArdupilotBridge:
                 self._socket.sendto(line, self._address)
 
     def _receive(self) -> ServoPacket | None:
-        """Return the next servo packet of our ArduPilot; None when none arrived in time.
-
-        Raises FirmwareLostError when it sends nothing but garbage.
-        """
+        """Return the next servo packet or None in time; FirmwareLostError after garbage only."""
         for _ in range(MAX_GARBAGE):
             try:
                 datagram, address = self._socket.recvfrom(_MAX_DATAGRAM)

@@ -172,16 +172,7 @@ class BoardLink:
     """
 
     def __init__(self, router: Router, device: str, baud: int) -> None:
-        """Configure the connection; nothing is opened yet.
-
-        Args:
-            router: Gets its line; its clients stay.
-            device: Serial device.
-            baud: Bits a second.
-
-        Raises:
-            UsageError: The line is too slow.
-        """
+        """Configure a serial line for a router with lasting clients; UsageError if too slow."""
         self.known = False
         """Whether the board was looked for already: its device may be absent for a while."""
         self.went_down = False
@@ -208,9 +199,9 @@ class BoardLink:
         """Return once a board in HIL mode has sent a heartbeat.
 
         Args:
-            timeout_s: How long to wait [wall s].
+            timeout_s: Timeout [wall s].
             alive: Called at intervals; raises to give up.
-            returning: Whether the device may be absent at first: it was there before.
+            returning: Whether the device was there before and may be absent at first.
 
         Raises:
             UsageError: The device cannot be opened.
@@ -254,10 +245,7 @@ class BoardLink:
         self._router.on_message = self.board.take
 
     def go_down(self, alive: Callable[[], None]) -> None:
-        """Reboot a board in HIL mode; return when it is down and the device closed.
-
-        Raises FirmwareLostError when it stays up.
-        """
+        """Reboot a board in HIL mode and close the device; FirmwareLostError when it stays up."""
         board, clock = self.board, self.clock
         deadline_us = clock.time_us() + int(REBOOT_S * US_PER_S)
         due_us, heard_us, heard = 0, clock.time_us(), -1
@@ -341,10 +329,7 @@ def _result(answer: int | None) -> str:
 
 
 def check_line(device: str, baud: int) -> int:
-    """Return what clients may send to the board [bytes/s].
-
-    Raises UsageError when the line does not carry the sensors.
-    """
+    """Return the clients' share of a line [bytes/s]; UsageError if it cannot carry the sensors."""
     check_baud(baud)
     carries = carries_bytes_s(device, baud)
     if carries is None:

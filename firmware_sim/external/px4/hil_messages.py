@@ -115,10 +115,7 @@ def sensor(sample: SensorSample, time_us: int) -> Values:
 
 
 def gps(fix: GpsFix, time_us: int) -> Values:
-    """Return HIL_GPS at the firmware's time [µs].
-
-    `eph` and `epv` are standard deviations [cm], not dilutions: so PX4 reads them.
-    """
+    """Return HIL_GPS at a time [µs]; PX4 reads `eph`, `epv` as standard deviations [cm]."""
     north, east, down = fix.velocity_ned.tolist()
     speed = math.hypot(north, east)
     course = COURSE_UNKNOWN
@@ -211,10 +208,9 @@ def lockstep(message: Controls) -> bool:
 
 
 def controls(message: Controls, time_us: int) -> ActuatorControls:
-    """Return the motor commands of HIL_ACTUATOR_CONTROLS, which hold from `time_us` on [µs].
+    """Return motor commands from `time_us` [µs]; ControlsError outside 0..1 while armed.
 
-    Motors are stopped while disarmed, whatever is commanded: PX4 in HITL sends commands then, too.
-    Raises ControlsError when, while armed, a command is not a number in 0..1.
+    Disarmed motors stop: PX4 in HITL sends commands even then.
     """
     if not armed(message):
         return ActuatorControls(time_us, STILL, armed=False)

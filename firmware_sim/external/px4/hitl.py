@@ -88,13 +88,7 @@ class HitlBridge:
         """When this process resumed after a standstill of its own [wall µs]."""
 
     def wait_connected(self, timeout_s: float, alive: Callable[[], None]) -> None:
-        """Find the board in HIL mode, reboot it, and find it again; see `Bridge`.
-
-        Raises:
-            UsageError: The device cannot be opened.
-            FirmwareMissingError: No board in HIL mode was found within `timeout_s`, each time.
-            FirmwareLostError: It does not reboot, or does not come back.
-        """
+        """Find the board in HIL mode, reboot it, and find it again; see `Bridge`."""
         link = self._link
         returning, link.known = link.known, True
         rebooted, link.went_down = link.went_down, False
@@ -105,11 +99,7 @@ class HitlBridge:
             link.connect(timeout_s, alive, returning=True)
 
     def step(self, sample: SensorSample) -> ActuatorControls:
-        """Send a tick's sensors, return the newest motor commands; see `Bridge`.
-
-        At first motors are stopped. Raises FirmwareMissingError when its first messages show a
-        configuration that cannot be flown.
-        """
+        """Send a tick's sensors and return the newest motor commands, at first stopped."""
         self._pace.wait(sample.time_us)
         link = self._link
         link.pump()

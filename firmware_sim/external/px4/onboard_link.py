@@ -39,15 +39,7 @@ class OnboardLink:
     """One end of the link, the one that MAVSDK's port is in a rehearsal of two processes."""
 
     def __init__(self, instance: int, alive: Callable[[], None]) -> None:
-        """Bind the port.
-
-        Args:
-            instance: PX4's instance number, which moves its ports.
-            alive: Called while an echo is waited for; raises FirmwareLostError when PX4 is gone.
-
-        Raises:
-            UsageError: The port is taken.
-        """
+        """Bind the port of an instance; `alive` is polled in waits and raises when PX4 is gone."""
         self._endpoint = UdpEndpoint(
             (LOOPBACK, API_PORT + instance),
             (LOOPBACK, API_LOCAL_PORT + instance),
@@ -75,13 +67,10 @@ class OnboardLink:
         self._endpoint.close()
 
     def await_echo(self) -> None:
-        """Return when PX4 has taken in all that was sent.
+        """Return when PX4 has processed everything sent, or raise FirmwareLostError.
 
-        To be called when no command is under way: setting the rate of a message, for one, takes
-        the thread that takes in messages some milliseconds of simulated time.
-
-        Raises:
-            FirmwareLostError: There is no echo: PX4 hangs, or has ended.
+        Not while a command is pending: setting a message's rate, for one, blocks PX4's receiver for
+        some milliseconds of simulated time.
         """
         number = self._echoes = (self._echoes + 1) & 0xFFFF_FFFF
         ping = self._encoder.pack(dialect.MAVLink_ping_message(0, number, 0, 0))

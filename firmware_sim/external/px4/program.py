@@ -44,10 +44,7 @@ class Px4Program:
     """Folder of its start-up scripts."""
 
     def start(self, instance: int, airframe: int, folder: Path) -> StartCommand:
-        """Return the command that starts it in a folder: in the background, without a shell.
-
-        The instance number moves all its ports; `airframe` is its SYS_AUTOSTART.
-        """
+        """Return the command to start an instance with an airframe (SYS_AUTOSTART)."""
         argv = [
             str(self.binary),
             *("-d", "-i", str(instance)),
@@ -57,10 +54,7 @@ class Px4Program:
 
 
 def find_px4(folder: Path) -> Px4Program:
-    """Return the PX4 of a build, a source tree or an unpacked package.
-
-    Raises FirmwareMissingError when there is none.
-    """
+    """Return the PX4 of a build, source tree or unpacked package, or raise FirmwareMissingError."""
     for layout in LAYOUTS:
         root = (folder / layout).resolve()
         binary, etc = root / "bin" / "px4", root / "etc"
@@ -78,10 +72,7 @@ def environment(airframe: int) -> dict[str, str]:
 
 
 def how_to_start(instance: int, airframe: int) -> str:
-    """Return the command with which a user starts a PX4 from its source tree, flight after flight.
-
-    It is a loop because PX4 is told to shut down at the end of a flight.
-    """
+    """Return the shell loop that restarts PX4 from its source tree after every flight."""
     variables = " ".join(f"{name}={value}" for name, value in environment(airframe).items())
     program = f"build/px4_sitl_default/bin/px4 -d -i {instance}"
     return f"while {variables} {program}; do sleep 1; done"

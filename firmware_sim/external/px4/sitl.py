@@ -80,17 +80,13 @@ class Px4Bridge:
         start_s: float = START_S,
         least_state_us: int = 1,
     ) -> None:
-        """Listen for PX4.
+        """Listen for PX4, or raise UsageError.
 
         Args:
             port: TCP port: 4560 + instance, 0 = any free one.
-            answer_s: Longest wait for an answer [wall s].
-            start_s: Longest wait for the first one [wall s].
-            least_state_us: The true state is sent no more often than that, however often PX4 asks
-                for it [µs].
-
-        Raises:
-            UsageError: The port is taken, or cannot be used.
+            answer_s: Timeout of an answer [wall s].
+            start_s: Timeout of the first one [wall s].
+            least_state_us: Minimum interval of the true state [µs].
         """
         self._least_state_us = least_state_us
         self.armed = False
@@ -141,8 +137,8 @@ class Px4Bridge:
     def settle(self) -> None:
         """Return once PX4 has done all that is due by its clock, as far as that can be seen.
 
-        Its controllers and its estimator have when it answers a sample. Its other threads may have
-        fallen behind, on a busy host.
+        Controllers and estimator are done when it answers a sample; other threads may lag on a busy
+        host.
         """
         if self._program is not None and self._answer is not None:
             self._program.settle()
@@ -186,10 +182,7 @@ class Px4Bridge:
     # --- sending
 
     def _pace(self) -> None:
-        """Wait until the next sample is due by the wall clock, or PX4 answers for the first time.
-
-        Sent faster than that, the samples of minutes would pile up in the connection.
-        """
+        """Wait for the next sample's wall time or PX4's first answer, to keep queues short."""
         clock = self._clock
         while (wait_us := self._pace_us - clock.time_us()) > 0 and self._answer is None:
             self._receive(min(wait_us / US_PER_S, WATCH_S))

@@ -163,10 +163,7 @@ class Router:
     # --- the line
 
     def attach(self, line: Line, budget_bytes_s: int) -> None:
-        """Use a line to the board, in place of another; the caller closes it.
-
-        Clients may send at most `budget_bytes_s` to the board [bytes/s].
-        """
+        """Replace the line to the board, with a client budget [bytes/s]; the caller closes it."""
         self.detach()
         self._line, self._line_fd = line, line.fileno()
         self._selector.register(self._line_fd, selectors.EVENT_READ)
@@ -182,10 +179,9 @@ class Router:
             self._line = None
 
     def send_ahead(self, frame: bytes) -> bool:
-        """Send a frame of the simulator: outside the budget, ahead of the clients' frames.
+        """Send a simulator frame ahead of the clients' and outside their budget.
 
-        Returns whether it was sent; False when the line is full, lost (see `lost`), or has not
-        shown to speak MAVLink.
+        Returns False when the line is full, lost (see `lost`), or has not shown to speak MAVLink.
         """
         if self._line is None or not self.speaks_mavlink:
             return False

@@ -47,10 +47,9 @@ class SerialPort:
     """An open serial device."""
 
     def __init__(self, device: str, baud: int = DEFAULT_BAUD) -> None:
-        """Open it exclusively, 8N1, without flow control; what had arrived before is dropped.
+        """Open a device exclusively, 8N1, without flow control and old data, or raise UsageError.
 
-        `device` is a path: /dev/ttyACM0, or better one of /dev/serial/by-id. USB and
-        pseudo-terminals ignore `baud` [bits/s]. Raises UsageError if it cannot be opened.
+        Prefer paths of /dev/serial/by-id. USB and pseudo-terminals ignore `baud` [bits/s].
         """
         check_baud(baud)
         self.device = device
@@ -91,10 +90,7 @@ class SerialPort:
         return bytes(received)
 
     def write(self, data: bytes) -> bool:
-        """Queue data to be sent; False when the queue is full: `data` is dropped.
-
-        Raises SerialLostError.
-        """
+        """Queue data to be sent; False when the queue is full. Raises SerialLostError."""
         self.drain()
         if len(self._waiting) + len(data) > BUFFER_BYTES:
             self.dropped += 1

@@ -84,10 +84,7 @@ class TcpPort:
         return False
 
     def receive(self, timeout_s: float) -> bytes | None:
-        """Return what has arrived, b"" when nothing did in time [wall s], None at the end.
-
-        May return b"" early.
-        """
+        """Return received data, b"" after a timeout [wall s] or early, None at the end."""
         connection = self._connected()
         for number, _ in self._poll.poll(timeout_s * MS_PER_S):
             if number == connection.fileno():
