@@ -16,20 +16,8 @@ from typing import Any, Protocol
 
 import psutil
 
+from airl_mav.black_box import messages
 from airl_mav.black_box.channels import encoded
-from airl_mav.black_box.messages import (
-    SUFFIX,
-    WARNING,
-    Decision,
-    End,
-    Message,
-    Phase,
-    Resources,
-    Status,
-    Telemetry,
-    image_message,
-    text,
-)
 from airl_mav.black_box.writing import BlackBoxFile
 from airl_mav.core.clock import Clock, processor_time_us, utc_now, utc_us
 from airl_mav.core.constants import US_PER_S
@@ -91,7 +79,7 @@ class BlackBoxRecorder:
         self._next_image_us = -math.inf
         self._unix_us = utc_us() - clock.time_us()
         """Calendar time of the clock's zero, kept for the whole flight: it never jumps."""
-        self._told: deque[Decided | tuple[Message, int]] = deque()
+        self._told: deque[Decided | tuple[messages.Message, int]] = deque()
         self._next_status_us = self._next_sync_us = 0
         self._process = psutil.Process()
         self._used_us, self._used_at_us = processor_time_us(), clock.time_us()
@@ -110,12 +98,12 @@ class BlackBoxRecorder:
     def phase(self, phase: str) -> None:
         """Take a phase that begins now."""
         now_us = self._clock.time_us()
-        self._told.append((Phase(now_us, phase), now_us))
+        self._told.append((messages.Phase(now_us, phase), now_us))
 
     def heard(self, message: str) -> None:
         """Take a text of the flight controller's."""
         now_us = self._clock.time_us()
-        said = text(message, "flight controller", self._unix_us + now_us)
+        said = messages.text(message, "flight controller", self._unix_us + now_us)
         self._told.append((said, now_us))
 
     def end(self, reason: str, notes: Sequence[str]) -> None:
@@ -123,9 +111,9 @@ class BlackBoxRecorder:
         self._stop()
         now_us = self._clock.time_us()
         for note in notes:
-            said = text(note, "companion", self._unix_us + now_us, WARNING)
+            said = messages.text(note, "companion", self._unix_us + now_us, messages.WARNING)
             self._told.append((said, now_us))
-        self._told.append((End(now_us, reason, tuple(notes)), now_us))
+        self._told.append((messages.End(now_us, reason, tuple(notes)), now_us))
         self.record(now_us, last=True)
 
     def break_off(self) -> None:
@@ -165,7 +153,7 @@ class BlackBoxRecorder:
             else:
                 self._write(*told)
         position, velocity, quaternion = _numbers(self._link.kinematics())
-        self._write(Telemetry(now_us, position, velocity, quaternion), now_us)
+        self._write(messages.Telemetry(now_us, position, velocity, quaternion), now_us)
         if now_us >= self._next_status_us:
             self._next_status_us = now_us + STATUS_US
             self._write(self._status(now_us), now_us)
@@ -174,7 +162,7 @@ class BlackBoxRecorder:
             self._next_sync_us = now_us + SYNC_US
             self._file.sync()
 
-    def _write(self, message: Message, now_us: int) -> None:
+    def _write(self, message: messages.Message, now_us: int) -> None:
         self._file.write(message, self._unix_us + now_us)
 
     def _write_decision(self, told: Decided) -> None:
@@ -182,7 +170,7 @@ class BlackBoxRecorder:
         age_us = told.started_us - frame.capture_time_us
         position, velocity, quaternion = _numbers(told.state)
         (away_m,) = _finite([goal_distance_m(self._goal, told.state.position)])
-        decision = Decision(
+        decision = messages.Decision(
             # A camera that stamps by another clock says nothing of its images' age.
             frame.capture_time_us if 0 <= age_us <= OLDEST_FRAME_US else NO_STAMP,
             told.seen.received_us,
@@ -200,20 +188,20 @@ class BlackBoxRecorder:
             self._next_image_us = told.started_us + self._image_us
             seen_us = told.seen.received_us
             taken_us, sent_us = self._unix_us + seen_us, told.sent_us
-            self._write(image_message(frame.image, taken_us), sent_us)
+            self._write(messages.image_message(frame.image, taken_us), sent_us)
             for name, each in frame.further.items():
-                channel, data = encoded(image_message(each.image, taken_us, name))
+                channel, data = encoded(messages.image_message(each.image, taken_us, name))
                 channel = channel._replace(topic=f"{channel.topic}/{name}")
                 self._file.add(channel, data, self._unix_us + sent_us)
 
-    def _status(self, now_us: int) -> Status:
+    def _status(self, now_us: int) -> messages.Status:
         status, battery = self._link.status(), self._link.battery()
-        return Status(now_us, status.armed, status.offboard, status.mode, *battery)
+        return messages.Status(now_us, status.armed, status.offboard, status.mode, *battery)
 
-    def _resources(self, now_us: int) -> Resources:
+    def _resources(self, now_us: int) -> messages.Resources:
         used_us, passed_us = processor_time_us() - self._used_us, now_us - self._used_at_us
         self._used_us, self._used_at_us = self._used_us + used_us, now_us
-        return Resources(
+        return messages.Resources(
             now_us,
             used_us / passed_us if passed_us > 0 else 0.0,
             psutil.cpu_percent(),
@@ -259,7 +247,7 @@ def open_recorder(
     }
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        file = BlackBoxFile(folder / f"{now:%Y%m%dT%H%M%S.%fZ}{SUFFIX}", {**run, **made})
+        file = BlackBoxFile(folder / f"{now:%Y%m%dT%H%M%S.%fZ}{messages.SUFFIX}", {**run, **made})
         file.sync()
     except OSError as error:
         raise FieldError("black_box", f"{folder}", problem=f"{error.strerror}") from None

@@ -26,15 +26,8 @@ from airl_mav.core.clock import Clock, WallClock
 from airl_mav.core.constants import UNMEASURED_A, US_PER_S
 from airl_mav.policy.actions import Attitude
 from airl_mav.policy.observation import Kinematics
+from companion import interfaces
 from companion.dialects import POSITION, PX4, Dialect, dialect_of
-from companion.interfaces import (
-    STOP,
-    BatteryState,
-    BodyVelocity,
-    LinkError,
-    Setpoint,
-    VehicleStatus,
-)
 from companion.mavsdk_connection import exchange_raw, first_autopilot, open_connection, set_timeout
 
 POLL_S = 0.1
@@ -112,7 +105,9 @@ class MavsdkLink:
         """Wait for a flight controller; LinkError after a timeout [wall s] or on `stop`."""
         system = first_autopilot(self._mavsdk, timeout_s, stop)
         if system is None:
-            raise LinkError(f"no flight controller heard on {self.url} in {timeout_s:g} s")
+            raise interfaces.LinkError(
+                f"no flight controller heard on {self.url} in {timeout_s:g} s"
+            )
         self._release_plugins()
         self._system = system
         self._telemetry = Telemetry(system)
@@ -134,7 +129,9 @@ class MavsdkLink:
         stopwatch = WallClock()
         while not self.connected:
             if stopwatch.time_us() > timeout_s * US_PER_S:
-                raise LinkError(f"no flight controller heard on {self.url} in {timeout_s:g} s")
+                raise interfaces.LinkError(
+                    f"no flight controller heard on {self.url} in {timeout_s:g} s"
+                )
             self._pause_wall(stop)
         if self._offboard is None:
             self._offboard = Offboard(self._system)
@@ -153,12 +150,12 @@ class MavsdkLink:
                     break
                 except TelemetryError as error:
                     if stopwatch.time_us() > STREAM_TIMEOUT_S * US_PER_S:
-                        raise LinkError(f"no telemetry: {_refusal(error)}") from None
+                        raise interfaces.LinkError(f"no telemetry: {_refusal(error)}") from None
                 self._pause_wall(stop)
 
     def _pause_wall(self, stop: threading.Event | None) -> None:
         if self._abandon.is_set() or (stop is not None and stop.is_set()):
-            raise LinkError("stopped")
+            raise interfaces.LinkError("stopped")
         WallClock().sleep_until(int(STREAM_RETRY_S * US_PER_S), self._abandon)
 
     def exchange_raw(self, sent: Callable[[bytes], None]) -> Callable[[bytes], None]:
@@ -241,18 +238,18 @@ class MavsdkLink:
             np.array([w.roll_rad_s, w.pitch_rad_s, w.yaw_rad_s]),
         )
 
-    def status(self) -> VehicleStatus:
+    def status(self) -> interfaces.VehicleStatus:
         """Return who flies."""
         mode = FlightMode(self._telemetry.flight_mode())
         words = mode.name.lower().replace("_", " ")
         remaining = self.battery().remaining
-        return VehicleStatus(self.armed, mode is FlightMode.OFFBOARD, words, remaining)
+        return interfaces.VehicleStatus(self.armed, mode is FlightMode.OFFBOARD, words, remaining)
 
-    def battery(self) -> BatteryState:
+    def battery(self) -> interfaces.BatteryState:
         """Return the newest state of the battery."""
         told = self._telemetry.battery()
         percent, current_a = _known(told.remaining_percent), _known(told.current_battery_a)
-        return BatteryState(
+        return interfaces.BatteryState(
             # No battery that flies has 0 V: nothing was heard of it yet.
             _known(told.voltage_v) or None,
             None if current_a == UNMEASURED_A else current_a,
@@ -321,7 +318,7 @@ class MavsdkLink:
 
     def enter_offboard(self) -> None:
         """Send a zero setpoint and switch to offboard; return when setpoints take effect."""
-        self.send_setpoint(STOP)
+        self.send_setpoint(interfaces.STOP)
         self._call("offboard", self._offboard.start)
         self._pause(OFFBOARD_SETTLE_S)
 
@@ -333,7 +330,7 @@ class MavsdkLink:
         """
         while not self._flies_offboard():
             self._check(None, stop=stop)
-            self.send_setpoint(STOP)
+            self.send_setpoint(interfaces.STOP)
             self._pause(OFFBOARD_REPEAT_S)
 
     def _flies_offboard(self) -> bool:
@@ -362,13 +359,13 @@ class MavsdkLink:
             self._direct = MavlinkDirect(self._system)
         self._direct.subscribe_message(name, heard)
 
-    def send_setpoint(self, setpoint: Setpoint) -> None:
+    def send_setpoint(self, setpoint: interfaces.Setpoint) -> None:
         """Send a setpoint; MAVSDK repeats it at 20 Hz until the next one, of whatever kind."""
         self.setpoints_sent += 1
         offboard = self._offboard
         try:
             # MAVSDK takes angles in degrees.
-            if isinstance(setpoint, BodyVelocity):
+            if isinstance(setpoint, interfaces.BodyVelocity):
                 *velocity, yaw_rate = setpoint
                 offboard.set_velocity_body(VelocityBodyYawspeed(*velocity, math.degrees(yaw_rate)))
                 return
@@ -379,7 +376,7 @@ class MavsdkLink:
             else:
                 offboard.set_attitude_rate(AttitudeRate(*degrees, thrust))
         except OffboardError as error:
-            raise LinkError(f"setpoint refused: {_reason(error)}") from None
+            raise interfaces.LinkError(f"setpoint refused: {_reason(error)}") from None
 
     def leave_offboard(self) -> None:
         """Switch to Hold; MAVSDK stops repeating setpoints."""
@@ -404,7 +401,7 @@ class MavsdkLink:
         try:
             call()
         except (ActionError, OffboardError, TelemetryError) as error:
-            raise LinkError(f"{what} failed: {_reason(error)}") from None
+            raise interfaces.LinkError(f"{what} failed: {_reason(error)}") from None
 
     def _deadline(self, timeout_s: float) -> int:
         return self._clock.time_us() + int(timeout_s * US_PER_S)
@@ -413,13 +410,13 @@ class MavsdkLink:
         self, deadline_us: int | None, message: str = "", stop: threading.Event | None = None
     ) -> None:
         if not self.connected:
-            raise LinkError("the flight controller is no longer heard")
+            raise interfaces.LinkError("the flight controller is no longer heard")
         if self._abandon.is_set():
-            raise LinkError("abandoned")
+            raise interfaces.LinkError("abandoned")
         if stop is not None and stop.is_set():
-            raise LinkError("stopped")
+            raise interfaces.LinkError("stopped")
         if deadline_us is not None and self._clock.time_us() >= deadline_us:
-            raise LinkError(message)
+            raise interfaces.LinkError(message)
 
     def _pause(self, seconds: float = POLL_S) -> None:
         self._clock.sleep_until(self._clock.time_us() + int(seconds * US_PER_S))

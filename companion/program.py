@@ -25,16 +25,8 @@ from airl_mav.policy.registry import camera_refused, find_policy
 from airl_mav.prediction.compensator import Compensator
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
+from airl_mav.scenario import piloting
 from airl_mav.scenario.model import LimitSettings, PilotSettings, WatchdogSettings
-from airl_mav.scenario.piloting import (
-    between_commands,
-    check_compensated,
-    check_goal_height,
-    check_quota,
-    decide_piloting,
-    load_asked_policy,
-    select_latency,
-)
 from airl_mav.scenario.stand_alone import StandAloneCompanion, check_companion
 from companion.camera import FrameSource, SharedFrames
 from companion.cameras.by_name import OpenCamera, open_named_camera
@@ -88,11 +80,11 @@ def prepare(asked: StandAloneCompanion) -> Mission:
     """Check the input and load the policy before any connection, or raise UsageError."""
     check_companion(asked)
     policy = find_policy(asked.policy, trust=asked.trust)
-    pilot, watchdog = decide_piloting(asked, policy, PilotSettings.goal_radius_m)
+    pilot, watchdog = piloting.decide_piloting(asked, policy, PilotSettings.goal_radius_m)
     # In lockstep no computer's own time counts; alone, this is the computer that is flown as.
-    injection = select_latency(asked, policy, on_this_computer=not asked.lockstep)
-    check_quota(asked, injection, "lockstep" if asked.lockstep else "sitl")
-    loaded = load_asked_policy(asked, policy, pilot.hold_s, asked.seed)
+    injection = piloting.select_latency(asked, policy, on_this_computer=not asked.lockstep)
+    piloting.check_quota(asked, injection, "lockstep" if asked.lockstep else "sitl")
+    loaded = piloting.load_asked_policy(asked, policy, pilot.hold_s, asked.seed)
     sampler = injection.sampler(latency_generator(asked.seed, asked.latency_seed))
     vehicle, compensator = load_vehicle(asked.vehicle), None
     if asked.tell_obstacles and vehicle.camera.kind != "depth":
@@ -109,8 +101,10 @@ def prepare(asked: StandAloneCompanion) -> Mission:
         raise FieldError(
             "policy", asked.policy, problem=f"does not fit vehicle {asked.vehicle}: {reason}"
         )
-    check_goal_height(policy, asked.goal, "goal", " ".join(f"{metres:g}" for metres in asked.goal))
-    check_compensated(pilot, policy, vehicle)
+    piloting.check_goal_height(
+        policy, asked.goal, "goal", " ".join(f"{metres:g}" for metres in asked.goal)
+    )
+    piloting.check_compensated(pilot, policy, vehicle)
     if pilot.compensate:
         compensator = Compensator(1, vehicle, Intrinsics.of(vehicle.camera))
     limits = asked.limits
@@ -129,7 +123,7 @@ def prepare(asked: StandAloneCompanion) -> Mission:
         computer_watts=0.0,
         injection=injection,
         speed=asked.speed,
-        between_commands=between_commands(pilot, watchdog.hover_after_s),
+        between_commands=piloting.between_commands(pilot, watchdog.hover_after_s),
         firmware="not known",
     )
     return Mission(

@@ -19,17 +19,9 @@ from mavsdk.plugins.action import Action
 from mavsdk.plugins.mavlink_direct import MavlinkDirect, MavlinkDirectError, MavlinkMessage
 from mavsdk.plugins.offboard import Offboard, VelocityBodyYawspeed, VelocityNedYaw
 
-from airl_mav.conformance import telemetry, vehicle_clock
+from airl_mav.conformance import mavlink_names, telemetry, vehicle_clock
 from airl_mav.conformance.autopilots import AUTOPILOTS, PX4, Autopilot
 from airl_mav.conformance.checklist import Transcript
-from airl_mav.conformance.mavlink_names import (
-    ARMED_FLAG,
-    CUSTOM_MODE_FLAG,
-    MavCommand,
-    MavFrame,
-    command_long,
-    name_of,
-)
 from airl_mav.conformance.steps import Setpoint
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
@@ -131,9 +123,9 @@ class Vehicle:
     def command(self, number: int, *params: float, note: str = "") -> int:
         """Send a COMMAND_LONG until answered and return its MAV_RESULT, or raise LinkError."""
         values = " ".join(f"{value:g}" for value in params)
-        what = f"{name_of(MavCommand, number)} {values}".strip()
+        what = f"{mavlink_names.name_of(mavlink_names.MavCommand, number)} {values}".strip()
         self.transcript.add("sent", f"COMMAND_LONG {what}{note and f': {note}'}")
-        message = self._message("COMMAND_LONG", command_long(number, *params))
+        message = self._message("COMMAND_LONG", mavlink_names.command_long(number, *params))
         for left in reversed(range(COMMAND_ATTEMPTS)):
             try:
                 answer = self._direct.send_command(message)
@@ -145,8 +137,8 @@ class Vehicle:
 
     def set_mode(self, mode: tuple[int, int], note: str) -> int:
         """Request a mode, by DO_SET_MODE's parameters 2 and 3, and return the MAV_RESULT."""
-        flags = CUSTOM_MODE_FLAG | (ARMED_FLAG if self.armed else 0)
-        return self.command(MavCommand.DO_SET_MODE, flags, *mode, note=note)
+        flags = mavlink_names.CUSTOM_MODE_FLAG | (mavlink_names.ARMED_FLAG if self.armed else 0)
+        return self.command(mavlink_names.MavCommand.DO_SET_MODE, flags, *mode, note=note)
 
     def fly(self, setpoint: Setpoint) -> float:
         """Send a setpoint, repeated by MAVSDK at 20 Hz; return its arrival [s, vehicle time]."""
@@ -226,7 +218,7 @@ class Vehicle:
     @property
     def armed(self) -> bool:
         """Whether the newest heartbeat says armed."""
-        return bool(self._newest("HEARTBEAT", "base_mode") & ARMED_FLAG)
+        return bool(self._newest("HEARTBEAT", "base_mode") & mavlink_names.ARMED_FLAG)
 
     @property
     def mode(self) -> int:
@@ -270,7 +262,7 @@ class Vehicle:
 class RawSetpoint(NamedTuple):
     """SET_POSITION_TARGET_LOCAL_NED; None is NaN."""
 
-    frame: MavFrame = MavFrame.LOCAL_NED
+    frame: mavlink_names.MavFrame = mavlink_names.MavFrame.LOCAL_NED
     mask: int = VELOCITY_AND_YAW
     vx: float | None = 0.0
     yaw_rad: float = 0.0

@@ -19,15 +19,9 @@ from airl_mav.experiments.flier import Flier, FlyEpisodes
 from airl_mav.experiments.live import Ended
 from airl_mav.experiments.store import CampaignStore
 from airl_mav.flight.record import EpisodeRecord
+from airl_mav.rehearsal import run_folder
 from airl_mav.rehearsal.episode_saver import EpisodeSaver
 from airl_mav.rehearsal.lock import locked
-from airl_mav.rehearsal.run_folder import (
-    FIRMWARE_PRINTS,
-    FlownEpisode,
-    RunFolder,
-    another_config,
-    open_folder,
-)
 from airl_mav.rehearsal.tally import Tally
 from airl_mav.scenario.resolved import PlannedEpisode, ResolvedScenario
 
@@ -42,7 +36,7 @@ class LockstepFlier:
         """Return how many episodes make a job; see `Flier`."""
         return 1
 
-    def start(self, folder: RunFolder, stop: Stop) -> FlyEpisodes:  # noqa: ARG002 (asked between flights)
+    def start(self, folder: run_folder.RunFolder, stop: Stop) -> FlyEpisodes:  # noqa: ARG002 (asked between flights)
         """Load everything; see `Flier`."""
         # Here: flight controller and MAVSDK are for those who fly, not for those who have it flown.
         from airl_mav.lockstep.flight import fly
@@ -50,9 +44,9 @@ class LockstepFlier:
 
         scenario = self.scenario
         warm_up(scenario.vehicle, scenario.scenario.plant)
-        log = folder.path / FIRMWARE_PRINTS  # of flights side by side, mixed
+        log = folder.path / run_folder.FIRMWARE_PRINTS  # of flights side by side, mixed
 
-        def fly_all(episodes: Sequence[PlannedEpisode]) -> Iterator[FlownEpisode]:
+        def fly_all(episodes: Sequence[PlannedEpisode]) -> Iterator[run_folder.FlownEpisode]:
             for episode in episodes:
                 tlog = folder.tlog_path(episode.index) if scenario.scenario.tlogs else None
                 policy = scenario.fresh_policy(episode.seed)
@@ -196,7 +190,9 @@ def shared_flights(cells: Sequence[Cell]) -> dict[str, Cell]:
         mine = cell.scenario
         for first in firsts:
             theirs = first.scenario
-            if theirs.seeds == mine.seeds and not another_config(theirs.config, mine.config):
+            if theirs.seeds == mine.seeds and not run_folder.another_config(
+                theirs.config, mine.config
+            ):
                 first_of[cell.name] = first
                 break
         else:
@@ -210,7 +206,7 @@ class _Job:
     """Episodes of one cell."""
 
     cell: str
-    folder: RunFolder
+    folder: run_folder.RunFolder
     episodes: tuple[PlannedEpisode, ...]
 
     def seeds(self) -> str:
@@ -225,11 +221,11 @@ class _Start:
 
     fliers: Mapping[str, Flier]
 
-    def __call__(self, stop: Stop) -> Callable[[_Job], Iterable[FlownEpisode]]:
+    def __call__(self, stop: Stop) -> Callable[[_Job], Iterable[run_folder.FlownEpisode]]:
         """Return what carries out a job."""
         loaded: tuple[str, FlyEpisodes] | None = None
 
-        def fly(job: _Job) -> Iterable[FlownEpisode]:
+        def fly(job: _Job) -> Iterable[run_folder.FlownEpisode]:
             nonlocal loaded
             if loaded is None or loaded[0] != job.cell:
                 loaded = None  # Large networks of two cells might not fit into the memory.
@@ -248,7 +244,7 @@ class _OpenCell:
         with ExitStack() as stack:
             say = partial(progress.note, style="yellow")
             stack.enter_context(nullcontext() if out is None else locked(out, say))
-            self.folder, self.done = open_folder(out, cell.name, cell.scenario)
+            self.folder, self.done = run_folder.open_folder(out, cell.name, cell.scenario)
             planned = len(cell.scenario.seeds)
             if self.done:
                 progress.note(
@@ -261,7 +257,7 @@ class _OpenCell:
             self.stack = stack.pop_all()
         self.episodes = {record.index: record for record in self.done}
 
-    def add(self, episode: FlownEpisode) -> None:
+    def add(self, episode: run_folder.FlownEpisode) -> None:
         """Take an episode that has just ended."""
         record = episode.record
         self._saver.add(episode)
@@ -319,7 +315,7 @@ def _run(
                 size = len(left)
                 if not executor.streams:
                     size = cell.flier.episodes_per_job(len(left), executor.workers)
-                folder = RunFolder(flying.folder.path.absolute())
+                folder = run_folder.RunFolder(flying.folder.path.absolute())
                 for i in range(0, len(left), size):
                     yield _Job(cell.name, folder, tuple(left[i : i + size]))
 

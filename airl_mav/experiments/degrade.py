@@ -8,13 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from airl_mav.core.errors import FieldError
-from airl_mav.experiments.experiment import (
-    Experiment,
-    ExperimentResult,
-    file_name,
-    make_cell,
-    run_and_compare,
-)
+from airl_mav.experiments import experiment
 from airl_mav.policy.registry import find_policy
 from airl_mav.scenario.model import Scenario
 
@@ -35,7 +29,7 @@ def degrade(
     compensated: bool = False,
     out: Path | str | None = None,
     progress: bool = False,
-) -> ExperimentResult:
+) -> experiment.ExperimentResult:
     """Fly policies at growing latencies and compare the results. Raises as `evaluate`.
 
     Args:
@@ -47,7 +41,7 @@ def degrade(
         progress: Draw progress bars on standard error.
     """
     declared = declare_degradation(scenario, latencies, policies, compensated=compensated)
-    return run_and_compare(declared, out, progress=progress)
+    return experiment.run_and_compare(declared, out, progress=progress)
 
 
 def declare_degradation(
@@ -56,7 +50,7 @@ def declare_degradation(
     policies: Sequence[str] = (),
     *,
     compensated: bool = False,
-) -> Experiment:
+) -> experiment.Experiment:
     """Declare a latency curve; see `degrade`. Raises UsageError."""
     if len(latencies) < 2 or len(set(latencies)) < len(latencies):
         raise FieldError("latencies", " ".join(latencies), "two or more, each once, growing")
@@ -71,8 +65,8 @@ def declare_degradation(
             label = latency if given is None or not Path(given).is_file() else Path(given).stem
             flown = {"policy": path, "latency": given, "workload": None, **way}
             cells.append(
-                make_cell(
-                    file_name(f"{policy}-{label}"),
+                experiment.make_cell(
+                    experiment.file_name(f"{policy}-{label}"),
                     f"{policy} at {label}",
                     scenario.model_copy(update=flown),
                     label=label,
@@ -81,7 +75,7 @@ def declare_degradation(
                 )
             )
     facts = {field: getattr(scenario, field) for field in FACTS}
-    return Experiment(
+    return experiment.Experiment(
         kind="degradation",
         name="-".join(found),
         facts={"policies": found, **facts},

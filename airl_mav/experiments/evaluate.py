@@ -7,14 +7,8 @@ from pathlib import Path
 
 from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import FieldError
+from airl_mav.experiments import experiment
 from airl_mav.experiments.campaign import Cell
-from airl_mav.experiments.experiment import (
-    Experiment,
-    ExperimentResult,
-    file_name,
-    make_cell,
-    run_and_compare,
-)
 from airl_mav.faults.model import Fault
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.statistics import aggregate
@@ -53,7 +47,7 @@ def evaluate(
     *,
     out: Path | str | None = None,
     progress: bool = False,
-) -> ExperimentResult:
+) -> experiment.ExperimentResult:
     """Fly policies in arenas on the same seeds and compare them in a table.
 
     Args:
@@ -68,7 +62,7 @@ def evaluate(
         RehearsalError: Processes or workers were lost too often.
         KeyboardInterrupt: Ctrl-C; finished flights are kept.
     """
-    return run_and_compare(matrix(scenario, policies, arenas), out, progress=progress)
+    return experiment.run_and_compare(matrix(scenario, policies, arenas), out, progress=progress)
 
 
 def matrix(
@@ -77,11 +71,11 @@ def matrix(
     arenas: Sequence[str] = (),
     *,
     each_fault: bool = False,
-) -> Experiment:
+) -> experiment.Experiment:
     """Declare a table of policies by arenas; `each_fault` adds a row per policy and fault."""
     cells = evaluation_cells(scenario, policies, arenas, each_fault=each_fault)
     facts = {field: getattr(scenario, field) for field in SHARED}
-    return Experiment("matrix", f"{len(policies)}-policies", facts, cells)
+    return experiment.Experiment("matrix", f"{len(policies)}-policies", facts, cells)
 
 
 def evaluation_cells(
@@ -107,8 +101,8 @@ def evaluation_cells(
         ways = [("", ()), *((f", {fault}", (fault,)) for fault in scenario.faults)]
         _check_names("faults", [told for told, _ in ways])
     return tuple(
-        make_cell(
-            file_name(f"{policy.name}-{Path(arena).stem}{told}"),
+        experiment.make_cell(
+            experiment.file_name(f"{policy.name}-{Path(arena).stem}{told}"),
             f"{policy.name}{told} in {Path(arena).stem}",
             scenario.model_copy(update={"policy": path, "arena": arena, "faults": faults}),
             label=f"{policy.name}{told}",

@@ -25,23 +25,7 @@ from typing import Any, ClassVar, Generic, NamedTuple
 from airl_mav.core.compiling import Heard, heard_compiling
 from airl_mav.core.errors import FieldError
 from airl_mav.core.provenance import usable_cores
-from airl_mav.experiments.executors import (
-    ONE_THREAD,
-    POLL_S,
-    Executor,
-    ExecutorSettings,
-    Failure,
-    InProcessExecutor,
-    J,
-    R,
-    Results,
-    Start,
-    Stop,
-    Work,
-    answer,
-    never,
-    next_attempt,
-)
+from airl_mav.experiments import executors
 from airl_mav.scenario.aircraft import GREATEST_INSTANCE, Aircraft
 from airl_mav.scenario.model import GREATEST_WORKERS, Workers
 
@@ -71,17 +55,17 @@ class ProcessExecutor:
 
     def run(
         self,
-        jobs: Iterable[J],
-        start: Start[J, R],
+        jobs: Iterable[executors.J],
+        start: executors.Start[executors.J, executors.R],
         *,
-        name: Callable[[J], str] = str,
-        stop: Stop = never,
+        name: Callable[[executors.J], str] = str,
+        stop: executors.Stop = executors.never,
         lost: Callable[[str], None] = lambda _: None,
         compiling: Heard = lambda _: None,
-    ) -> Results[J, R]:
+    ) -> executors.Results[executors.J, executors.R]:
         """Carry out jobs; see `executors.Executor`. Only workers that are busy end with it."""
         waiting = iter(jobs)
-        pool: _Pool[J] = _Pool(start, self._idle)
+        pool: _Pool[executors.J] = _Pool(start, self._idle)
         try:
             while len(pool.busy) < self.workers and not stop():
                 try:
@@ -89,7 +73,7 @@ class ProcessExecutor:
                 except StopIteration:
                     break
             while pool.busy:
-                for connection in wait(list(pool.busy), POLL_S):
+                for connection in wait(list(pool.busy), executors.POLL_S):
                     assert isinstance(connection, Connection)  # noqa: S101 (as they went in)
                     worker = pool.busy[connection]
                     job = worker.job
@@ -97,13 +81,15 @@ class ProcessExecutor:
                         told = connection.recv()
                     except (EOFError, OSError):
                         cause = pool.bury(connection)
-                        pool.hire(job, next_attempt(name(job), worker.attempt, cause, lost))
+                        pool.hire(
+                            job, executors.next_attempt(name(job), worker.attempt, cause, lost)
+                        )
                         continue
                     if isinstance(told, _Compiling):
                         worker.compiles = told.begins
                         compiling(any(each.compiles for each in pool.busy.values()))
                         continue
-                    if isinstance(told, Failure):
+                    if isinstance(told, executors.Failure):
                         raise told.error(name(job))
                     # The worker goes on before anything is done with its results.
                     pool.give(connection, waiting)
@@ -132,11 +118,11 @@ class _Idle(NamedTuple):
 
 
 @dataclass
-class _Worker(Generic[J]):
+class _Worker(Generic[executors.J]):
     """A worker as its parent sees it."""
 
     process: BaseProcess
-    job: J
+    job: executors.J
     """What it does now."""
     attempt: int
     """Number of workers that this job has been given to."""
@@ -144,16 +130,16 @@ class _Worker(Generic[J]):
     """Whether it compiles kernels now."""
 
 
-class _Pool(Generic[J]):
+class _Pool(Generic[executors.J]):
     """The worker processes of one run."""
 
-    def __init__(self, start: Start[J, Any], idle: list[_Idle]) -> None:
+    def __init__(self, start: executors.Start[executors.J, Any], idle: list[_Idle]) -> None:
         self._start = start
-        self.busy: dict[Connection, _Worker[J]] = {}
+        self.busy: dict[Connection, _Worker[executors.J]] = {}
         self._idle = idle
         """Those without work: they are taken before new ones are started."""
 
-    def hire(self, job: J, attempt: int = 1) -> None:
+    def hire(self, job: executors.J, attempt: int = 1) -> None:
         """Take a worker and give it its first job of this run."""
         worker = self._take_idle() or _spawn()
         self.busy[worker.connection] = _Worker(worker.process, job, attempt)
@@ -169,7 +155,7 @@ class _Pool(Generic[J]):
             _remove(worker.process)
         return None
 
-    def give(self, connection: Connection, waiting: Iterator[J]) -> None:
+    def give(self, connection: Connection, waiting: Iterator[executors.J]) -> None:
         """Give a worker its next job, or let it wait for the next run."""
         worker = self.busy[connection]
         try:
@@ -222,7 +208,7 @@ def _spawn() -> _Idle:
     process = context.Process(target=_serve, args=(theirs,), daemon=True)
     with ExitStack() as stack:
         stack.enter_context(theirs)
-        stack.enter_context(_environment(ONE_THREAD))
+        stack.enter_context(_environment(executors.ONE_THREAD))
         stack.enter_context(_interrupts_blocked())
         stack.enter_context(_program_hidden())
         process.start()
@@ -285,14 +271,14 @@ class _Compiling:
 def _serve(connection: Connection) -> None:
     """Carry out jobs until the pipe is closed; the first one of a run says how to start."""
     _end_with_parent()
-    start: Start[Any, Any] | None = None
-    work: Work[Any, Any] | None = None
+    start: executors.Start[Any, Any] | None = None
+    work: executors.Work[Any, Any] | None = None
 
     def carry_out(job: Any) -> Iterable[Any]:
         nonlocal start, work
         if start is not None:
             work = None  # What was loaded for the run before goes first.
-            work, start = start(never), None
+            work, start = start(executors.never), None
         assert work is not None  # noqa: S101 (no run begins without a start)
         return work(job)
 
@@ -307,7 +293,7 @@ def _serve(connection: Connection) -> None:
             return
         start = new or start
         with heard_compiling(tell):
-            told = answer(partial(carry_out, job))
+            told = executors.answer(partial(carry_out, job))
         try:
             connection.send(told)
         except OSError:  # The parent has gone.
@@ -335,7 +321,7 @@ def side_by_side(settings: Workers) -> int:
 
 
 @contextmanager
-def open_executor(settings: Workers, *, in_process: bool = False) -> Iterator[Executor]:
+def open_executor(settings: Workers, *, in_process: bool = False) -> Iterator[executors.Executor]:
     """Open the executor of the settings.
 
     Args:
@@ -350,7 +336,7 @@ def open_executor(settings: Workers, *, in_process: bool = False) -> Iterator[Ex
         # Imported here: Ray is an extra.
         from airl_mav.experiments.ray_executor import connected
 
-        gpus = settings.ray_gpus if isinstance(settings, ExecutorSettings) else 0.0
+        gpus = settings.ray_gpus if isinstance(settings, executors.ExecutorSettings) else 0.0
         with connected(settings, cores, gpus) as executor:
             yield executor
         return
@@ -359,7 +345,7 @@ def open_executor(settings: Workers, *, in_process: bool = False) -> Iterator[Ex
         raise FieldError("workers", settings.workers, f"1 <= value <= {most} with this firmware")
     workers = settings.workers or (1 if in_process else min(cores, most))
     if in_process and workers == 1:
-        yield InProcessExecutor()
+        yield executors.InProcessExecutor()
         return
     with ProcessExecutor(workers) as executor:
         yield executor

@@ -20,21 +20,7 @@ from typing import Any, ClassVar
 
 from airl_mav.core.compiling import Heard
 from airl_mav.core.errors import FieldError
-from airl_mav.experiments.executors import (
-    ONE_THREAD,
-    POLL_S,
-    Failure,
-    J,
-    R,
-    Results,
-    Start,
-    Stop,
-    Work,
-    WorkerError,
-    answer,
-    never,
-    next_attempt,
-)
+from airl_mav.experiments import executors
 from airl_mav.scenario.model import Workers
 
 LOCAL = "local"
@@ -61,23 +47,23 @@ class RayExecutor:
 
     def run(
         self,
-        jobs: Iterable[J],
-        start: Start[J, R],
+        jobs: Iterable[executors.J],
+        start: executors.Start[executors.J, executors.R],
         *,
-        name: Callable[[J], str] = str,
-        stop: Stop = never,
+        name: Callable[[executors.J], str] = str,
+        stop: executors.Stop = executors.never,
         lost: Callable[[str], None] = lambda _: None,
         compiling: Heard = lambda _: None,  # noqa: ARG002 (see there)
-    ) -> Results[J, R]:
+    ) -> executors.Results[executors.J, executors.R]:
         """Carry out jobs; see `executors.Executor`."""
         import ray
 
         task = ray.remote(num_cpus=1, num_gpus=self.gpus, max_retries=0)(_carry_out)
         pickled = pickle.dumps(start)
         key, shared = hashlib.sha256(pickled).hexdigest(), ray.put(pickled)
-        waiting, busy = iter(jobs), dict[Any, tuple[J, int]]()
+        waiting, busy = iter(jobs), dict[Any, tuple[executors.J, int]]()
 
-        def begin(job: J, attempt: int = 1) -> None:
+        def begin(job: executors.J, attempt: int = 1) -> None:
             busy[task.remote(key, shared, job)] = job, attempt
 
         def fill() -> None:
@@ -90,18 +76,21 @@ class RayExecutor:
         try:
             fill()
             while busy and not stop():
-                for ref in ray.wait(list(busy), timeout=POLL_S)[0]:
+                for ref in ray.wait(list(busy), timeout=executors.POLL_S)[0]:
                     job, attempt = busy.pop(ref)
                     try:
                         told = ray.get(ref)
                     except ray.exceptions.RayTaskError as error:
                         # Not the job, which answers for itself: it could not even begin.
                         last = f"{error}".strip().splitlines()[-1]
-                        raise WorkerError(f"{name(job)}: {last}") from None
+                        raise executors.WorkerError(f"{name(job)}: {last}") from None
                     except ray.exceptions.RayError as error:
-                        begin(job, next_attempt(name(job), attempt, type(error).__name__, lost))
+                        begin(
+                            job,
+                            executors.next_attempt(name(job), attempt, type(error).__name__, lost),
+                        )
                         continue
-                    if isinstance(told, Failure):
+                    if isinstance(told, executors.Failure):
                         raise told.error(name(job))
                     fill()
                     for result in told:
@@ -111,7 +100,7 @@ class RayExecutor:
                 ray.cancel(ref, force=True)
 
 
-_started: dict[str, Work[Any, Any]] = {}
+_started: dict[str, executors.Work[Any, Any]] = {}
 """What this worker of Ray has loaded, by its key: of one run at a time."""
 
 
@@ -122,12 +111,12 @@ def _carry_out(key: str, pickled: bytes, job: Any) -> Any:
         if key not in _started:
             _started.clear()
             # Before numba and its like are imported, which they are from here on.
-            os.environ.update(ONE_THREAD)
-            _started[key] = pickle.loads(pickled)(never)  # noqa: S301 (from the driver, by Ray)
+            os.environ.update(executors.ONE_THREAD)
+            _started[key] = pickle.loads(pickled)(executors.never)  # noqa: S301 (from the driver, by Ray)
         results: Iterable[Any] = _started[key](job)
         return results
 
-    return answer(work)
+    return executors.answer(work)
 
 
 def _check_reachable(address: str) -> None:

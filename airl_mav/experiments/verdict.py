@@ -25,14 +25,8 @@ from airl_mav.flight.requirements import Requirement
 from airl_mav.flight.sequential import LOOKS, Decision
 from airl_mav.flight.statistics import reached_goals
 from airl_mav.rehearsal.run_folder import RUN_FILE, check_folder, load_info
+from airl_mav.report.comparison import show
 from airl_mav.report.comparison.model import Comparison, comparison_file
-from airl_mav.report.comparison.show import (
-    FLOWN_UNTIL,
-    Runs,
-    build_comparison,
-    judge_comparison,
-    write_comparison,
-)
 from airl_mav.report.verdict import OverallVerdict
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
@@ -48,7 +42,7 @@ class SoughtVerdict:
     verdict: OverallVerdict | None = None
     """None: it was interrupted or broken off."""
     comparison: Comparison | None = None
-    runs: Runs | None = None
+    runs: show.Runs | None = None
     """Of the comparison, by name."""
     page: Path | None = None
 
@@ -105,12 +99,12 @@ def seek_verdict(
     if flown.ended != "complete":
         return SoughtVerdict(out, flown.ended)
     progress.status(DRAWING)
-    facts = {**declared.facts, "episodes": n, FLOWN_UNTIL: "the success rate was decided"}
+    facts = {**declared.facts, "episodes": n, show.FLOWN_UNTIL: "the success rate was decided"}
     # The number planned is that of the last look, as the run says itself.
     entries = [replace(entry_of(cell, cell.name), planned=None) for cell in (undelayed, target)]
-    comparison, runs = build_comparison(out, declared.kind, facts, entries)
-    verdict = judge_comparison(comparison, runs, requirements)
-    page = write_comparison(comparison, runs, out, verdict)
+    comparison, runs = show.build_comparison(out, declared.kind, facts, entries)
+    verdict = show.judge_comparison(comparison, runs, requirements)
+    page = show.write_comparison(comparison, runs, out, verdict)
     progress.status(None)
     return SoughtVerdict(out, "complete", verdict, comparison, runs, page)
 

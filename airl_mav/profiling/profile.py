@@ -29,14 +29,8 @@ from airl_mav.profiles.computer import (
     existing_profile,
     with_workload,
 )
+from airl_mav.profiling import measurement
 from airl_mav.profiling.bare import BareLoop
-from airl_mav.profiling.measurement import (
-    ComputerMeasurement,
-    DrawnPower,
-    ProfilingError,
-    Recording,
-    save,
-)
 from airl_mav.profiling.policy_under_test import PolicyUnderTest, open_policy
 from airl_mav.profiling.request import ProfileRequest
 from airl_mav.profiling.soak import Reading, Soak, soak
@@ -61,7 +55,7 @@ def profile(
     out: Path | None = None,
     progress: Progress | None = None,
     root: Path = Path("/"),
-) -> ComputerMeasurement:
+) -> measurement.ComputerMeasurement:
     """Measure the latency of a policy's decisions on this computer.
 
     Args:
@@ -102,14 +96,16 @@ def profile(
         finally:
             bar.close()
         after = machine_state()
-        power = DrawnPower(told_by, idle_w, meter.mean_w if meter else None)
+        power = measurement.DrawnPower(told_by, idle_w, meter.mean_w if meter else None)
         soaked = _soak(request, policy, source, progress) if request.soak else None
     if remark := busy_remark(before, int(machine["cores_usable"])):
         recording = replace(recording, remarks=(*recording.remarks, remark))
     date = f"{utc_now():%Y-%m-%d}"
     t2_us = recording.stages["t2"]
     if (longest_ms := t2_us.max() / US_PER_MS) > LONGEST_MS:
-        raise ProfilingError(f"a decision took {longest_ms:.0f} ms; accepted: {LONGEST_MS:g} ms")
+        raise measurement.ProfilingError(
+            f"a decision took {longest_ms:.0f} ms; accepted: {LONGEST_MS:g} ms"
+        )
     # A clock of whole µs may give 0 for what is faster.
     samples_ms = (np.maximum(t2_us, 1) / US_PER_MS).tolist()
     workload = Workload(
@@ -122,7 +118,7 @@ def profile(
     )
     name = request.workload or _workload_name(request, card.name)
     known = _computer(request, computer, cpu, held, date, power)
-    measured = ComputerMeasurement(
+    measured = measurement.ComputerMeasurement(
         request=request,
         card=card,
         recording=recording,
@@ -135,10 +131,10 @@ def profile(
         power=power,
         soak=soaked,
     )
-    return measured if path is None else replace(measured, files=save(measured, path))
+    return measured if path is None else replace(measured, files=measurement.save(measured, path))
 
 
-def _measure(request: ProfileRequest, policy: PolicyUnderTest, bar: Bar) -> Recording:
+def _measure(request: ProfileRequest, policy: PolicyUnderTest, bar: Bar) -> measurement.Recording:
     """Measure at the level that was asked for. Imported late: only sitl needs the simulator."""
     if request.level == "bare":
         from airl_mav.profiling.bare import measure
@@ -148,10 +144,10 @@ def _measure(request: ProfileRequest, policy: PolicyUnderTest, bar: Bar) -> Reco
         from airl_mav.profiling.sitl import measure
     try:
         return measure(request, policy, bar)
-    except ProfilingError:
+    except measurement.ProfilingError:
         raise
     except RuntimeError as error:  # of what runs the network
-        raise ProfilingError(str(error)) from error
+        raise measurement.ProfilingError(str(error)) from error
 
 
 def _idle_power(source: PowerSource) -> float | None:
@@ -213,7 +209,7 @@ def _computer(
     cpu: str,
     held: ComputerProfile | None,
     date: str,
-    power: DrawnPower,
+    power: measurement.DrawnPower,
 ) -> ComputerProfile:
     """Return the computer as its file has it, with the request's watts and price.
 

@@ -12,14 +12,7 @@ from airl_mav.latency.coordinated_omission import CommandAges, command_ages
 from airl_mav.latency.percentiles import Summary
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.rehearsal.run_folder import LoadedRun
-from airl_mav.report.table import (
-    DURATION_COLUMNS,
-    Column,
-    TableView,
-    duration_cells,
-    ms,
-    percentile_cell,
-)
+from airl_mav.report import table
 from airl_mav.report.tracking import TrackedFlight
 
 ROWS = (
@@ -31,7 +24,7 @@ ROWS = (
 )
 
 
-def estimation_table(flights: Sequence[TrackedFlight]) -> TableView | None:
+def estimation_table(flights: Sequence[TrackedFlight]) -> table.TableView | None:
     """Return the errors of the estimator in navigation; None where no flight recorded them."""
     known = [(f.time_s >= 0.0, f.errors) for f in flights if f.errors is not None]
     known = [(flies, errors) for flies, errors in known if flies.any()]
@@ -43,17 +36,17 @@ def estimation_table(flights: Sequence[TrackedFlight]) -> TableView | None:
         figures = (np.median(values), np.percentile(values, 95.0), values.max())
         rows.append((title, unit, *(f"{figure:.2f}" for figure in figures)))
     columns = (
-        Column("error of the estimate", number=False),
-        Column("unit", number=False),
-        Column("median"),
-        Column("p95"),
-        Column("greatest"),
+        table.Column("error of the estimate", number=False),
+        table.Column("unit", number=False),
+        table.Column("median"),
+        table.Column("p95"),
+        table.Column("greatest"),
     )
     notes = (
         f"Between what the flight controller believed and the true state, 50 times a second, "
         f"{len(known):,} flights from the start of navigation.",
     )
-    return TableView("estimation", "Estimator", columns, tuple(rows), notes)
+    return table.TableView("estimation", "Estimator", columns, tuple(rows), notes)
 
 
 def run_ages(run: LoadedRun) -> CommandAges:
@@ -78,23 +71,23 @@ def _acted(stamps: Mapping[str, NDArray[Any]]) -> tuple[NDArray[np.int64], NDArr
     return frames[both].astype(np.int64), motors[both].astype(np.int64)
 
 
-def ages_table(ages: CommandAges, end_to_end: Summary) -> TableView | None:
+def ages_table(ages: CommandAges, end_to_end: Summary) -> table.TableView | None:
     """Return the age of the flown command beside its latency; None without consecutive commands."""
     n = ages.youngest_us.size
     if not n or not ages.time_us:
         return None
     columns = (
-        Column("how old the flown command was", number=False),
-        *DURATION_COLUMNS,
+        table.Column("how old the flown command was", number=False),
+        *table.DURATION_COLUMNS,
     )
     rows = (
-        ("as it took effect, by decision", *duration_cells(end_to_end)),
+        ("as it took effect, by decision", *table.duration_cells(end_to_end)),
         (
             "at any moment, by time",
             f"{n:,}",
-            ms(ages.mean),
-            *(percentile_cell(ages.percentile(p), n) for p in (50.0, 90.0, 99.0)),
-            ms(float(ages.oldest_us.max())),
+            table.ms(ages.mean),
+            *(table.percentile_cell(ages.percentile(p), n) for p in (50.0, 90.0, 99.0)),
+            table.ms(float(ages.oldest_us.max())),
         ),
     )
     notes = (
@@ -102,4 +95,4 @@ def ages_table(ages: CommandAges, end_to_end: Summary) -> TableView | None:
         "however long it lasts; by time it weighs what the vehicle flew of it (coordinated "
         "omission).",
     )
-    return TableView("ages", "Age of the flown command", columns, rows, notes)
+    return table.TableView("ages", "Age of the flown command", columns, rows, notes)

@@ -15,17 +15,10 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from airl_mav.arena.geometry import Arena
+from airl_mav.camera import primitives
 from airl_mav.camera.frame import depth_to_z16
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.picture import antialiased, grey, render_picture
-from airl_mav.camera.primitives import (
-    CEILING,
-    FLOOR,
-    OBSTACLE,
-    SKY,
-    WALL_EAST_WEST,
-    WALL_NORTH_SOUTH,
-)
 from airl_mav.camera.render import camera_pose
 from airl_mav.core.constants import US_PER_MS
 from airl_mav.core.errors import UsageError
@@ -36,11 +29,11 @@ from airl_mav.report.forensics.camera_view import PolicyCamera
 from airl_mav.report.replay.flight import ReplayedFlight
 
 ROOM = {
-    CEILING: (236, 238, 240),
-    SKY: (38, 42, 48),
-    FLOOR: (120, 124, 130),
-    WALL_NORTH_SOUTH: (178, 184, 192),
-    WALL_EAST_WEST: (208, 212, 218),
+    primitives.CEILING: (236, 238, 240),
+    primitives.SKY: (38, 42, 48),
+    primitives.FLOOR: (120, 124, 130),
+    primitives.WALL_NORTH_SOUTH: (178, 184, 192),
+    primitives.WALL_EAST_WEST: (208, 212, 218),
 }
 """Colours of what is no obstacle; no obstacle has a grey."""
 
@@ -49,10 +42,10 @@ def coloured_segmentation(seen: NDArray[np.int32]) -> NDArray[np.uint8]:
     """Return `Picture.seen` (h, w) as RGB (h, w, 3), obstacles in tab20 without its greys."""
     tab20 = colormaps["tab20"](np.arange(20), bytes=True)[:, :3]
     own = np.delete(tab20, (14, 15), axis=0)
-    most = max(int(seen.max(initial=0)) + 1, OBSTACLE)
+    most = max(int(seen.max(initial=0)) + 1, primitives.OBSTACLE)
     # The number of the ceiling is -1: the last row.
     table = np.empty((most + 1, 3), np.uint8)
-    table[OBSTACLE:most] = own[np.arange(most - OBSTACLE) % len(own)]
+    table[primitives.OBSTACLE : most] = own[np.arange(most - primitives.OBSTACLE) % len(own)]
     for number, colour in ROOM.items():
         table[number] = colour
     coloured: NDArray[np.uint8] = table[seen]

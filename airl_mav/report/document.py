@@ -19,17 +19,8 @@ from rich.text import Text
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import replace_file
 from airl_mav.flight.statistics import Estimate
+from airl_mav.report import table
 from airl_mav.report.measures import interval_of
-from airl_mav.report.table import (
-    NONE,
-    OUTCOME_LABELS,
-    TableView,
-    escape_markdown,
-    markdown_table,
-    print_facts,
-    print_table,
-    stacked,
-)
 from airl_mav.report.theme import Picture, montage
 
 REPORT_FILE = "report.html"
@@ -62,7 +53,7 @@ class Section:
     """On the page alone."""
     sentences: tuple[str, ...] = ()
     facts: Facts = ()
-    tables: tuple[TableView, ...] = ()
+    tables: tuple[table.TableView, ...] = ()
     draw: Callable[[], Sequence[Picture]] | None = None
     """Draws the pictures; called only where they are shown."""
     sheet: str = ""
@@ -120,7 +111,7 @@ def estimate_headline(
 ) -> Headline:
     """Return an estimate as a headline with its interval and n."""
     if estimate.value is None:
-        return Headline(title, NONE, "", f"n = {estimate.n:,}")
+        return Headline(title, table.NONE, "", f"n = {estimate.n:,}")
     details = [interval_of(estimate, digits, sign), f"n = {estimate.n:,}", *more]
     value = f"{estimate.value:{sign}.{digits}f}"
     return Headline(title, value, unit, ", ".join(text for text in details if text))
@@ -143,10 +134,10 @@ def environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    made.filters["stacked"] = stacked
-    made.globals["outcome_labels"] = OUTCOME_LABELS
+    made.filters["stacked"] = table.stacked
+    made.globals["outcome_labels"] = table.OUTCOME_LABELS
     made.globals["outcome_keys"] = {
-        label: outcome.value for outcome, label in OUTCOME_LABELS.items()
+        label: outcome.value for outcome, label in table.OUTCOME_LABELS.items()
     }
     return made
 
@@ -192,22 +183,24 @@ def markdown(document: Document) -> str:
     """Return a document without its pictures as Markdown."""
 
     def listed(facts: Facts) -> str:
-        return "\n".join(f"- {escape_markdown(k)}: {escape_markdown(v)}" for k, v in facts)
+        return "\n".join(
+            f"- {table.escape_markdown(k)}: {table.escape_markdown(v)}" for k, v in facts
+        )
 
-    parts = [f"# {escape_markdown(document.title)}", escape_markdown(document.lead)]
-    parts += [escape_markdown(answer) for answer in document.answers]
+    parts = [f"# {table.escape_markdown(document.title)}", table.escape_markdown(document.lead)]
+    parts += [table.escape_markdown(answer) for answer in document.answers]
     parts.append(listed(document.facts))
     for section in document.sections:
         said = (section.sentences, section.facts, section.tables)
         if not any(said) and section.level > 2:
             continue
         if section.title not in [view.title for view in section.tables]:
-            parts.append(f"{'#' * (section.level - 1)} {escape_markdown(section.title)}")
-        parts.append("\n".join(f"- {escape_markdown(line)}" for line in section.sentences))
+            parts.append(f"{'#' * (section.level - 1)} {table.escape_markdown(section.title)}")
+        parts.append("\n".join(f"- {table.escape_markdown(line)}" for line in section.sentences))
         parts.append(listed(section.facts))
-        parts += [markdown_table(view) for view in section.tables]
+        parts += [table.markdown_table(view) for view in section.tables]
         if section.draw is None:
-            parts.append(escape_markdown(section.note))
+            parts.append(table.escape_markdown(section.note))
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
@@ -222,7 +215,7 @@ def print_document(document: Document, console: Console, page: Path) -> None:
     if document.answers:
         print_verdict(((document.lead,) if document.lead else ()) + document.answers, console)
         console.print()
-    print_facts(document.facts, console)
+    table.print_facts(document.facts, console)
     shown = [section for section in document.sections if section.in_terminal]
     several = sum(section.level == 2 for section in shown) > 1
     for section in shown:
@@ -230,11 +223,11 @@ def print_document(document: Document, console: Console, page: Path) -> None:
             console.print()
             console.rule(Text(section.title, style="bold"), align="left", style="dim")
         if section.facts:
-            print_facts(section.facts, console, style="bold")
+            table.print_facts(section.facts, console, style="bold")
         for view in section.tables:
             if view.in_terminal != "not":
                 console.print()
-                print_table(view, console, wrap=True)
+                table.print_table(view, console, wrap=True)
         if section.note and section.draw is None:
             console.print(Text(section.note, style="dim"))
         if section.sentences:

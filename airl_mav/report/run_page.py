@@ -14,16 +14,9 @@ from airl_mav.arena.geometry import Arena
 from airl_mav.core.files import replace_file
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import LoadedRun
+from airl_mav.report import document, run_tables
 from airl_mav.report.ages import ages_table, estimation_table, run_ages
 from airl_mav.report.conduct import conduct_table
-from airl_mav.report.document import (
-    REPORT_FILE,
-    SHEET_COLUMNS,
-    Headline,
-    environment,
-    estimate_headline,
-    provenance_facts,
-)
 from airl_mav.report.energy import (
     energy_figure,
     energy_flights_table,
@@ -38,13 +31,6 @@ from airl_mav.report.measures import rate_digits
 from airl_mav.report.packing import packed
 from airl_mav.report.run_figures import latency_figure
 from airl_mav.report.run_summary import RunSummary, summarize_run
-from airl_mav.report.run_tables import (
-    episodes_table,
-    latency_table,
-    quality_table,
-    real_time_table,
-    setup_rows,
-)
 from airl_mav.report.scene import ALL_FLIGHTS, plotly_script
 from airl_mav.report.shown_flights import (
     ShownFlights,
@@ -96,7 +82,7 @@ def build_page(
     samples = [(s, summary.samples[s.key], summary.stages[s.key]) for s in drawn]
     latency_pictures = [latency_figure(*part) for part in samples]
     if latency_pictures:
-        replace_file(folder / "latency.png", montage(latency_pictures, SHEET_COLUMNS))
+        replace_file(folder / "latency.png", montage(latency_pictures, document.SHEET_COLUMNS))
     decisions = timeline_of(run)
     timeline = timeline_figure(decisions, drawn) if drawn and len(decisions) else None
     energies, on_ground = flight_energies(run, vehicle), run.info.setup.computer_on_ground
@@ -116,7 +102,7 @@ def build_page(
     data = page_data(run, view, [*packed_pictures, *latency_pictures], vehicle)
     slowest = slowest_table(decisions, measured) if len(decisions) else None
     page = (
-        environment()
+        document.environment()
         .get_template("report.html.j2")
         .render(
             kind=_kind(run, summary),
@@ -131,11 +117,11 @@ def build_page(
             status="" if verdict is None else verdict.status,
             headlines=run_headlines(run, summary),
             origin=run.info.setup.injection.origin,
-            setup=setup_rows(run),
-            quality=quality_table(summary, computer=not on_ground),
+            setup=run_tables.setup_rows(run),
+            quality=run_tables.quality_table(summary, computer=not on_ground),
             conduct=conduct_table(run, summary),
             faults=faults_table(run),
-            real_time=real_time_table(run, summary) if summary.timed else None,
+            real_time=run_tables.real_time_table(run, summary) if summary.timed else None,
             overview=overview,
             worst=worst_table(judged, len(run.episodes)) if judged else None,
             worst_links=[_link(view, j.record.index) for j in judged],
@@ -151,21 +137,21 @@ def build_page(
             energy=energy,
             energy_table=energy_table(energies, on_ground=on_ground) if energies else None,
             energy_flights=energy_flights_table(energies, MAX_LISTED) if energies else None,
-            latency=latency_table(summary),
+            latency=run_tables.latency_table(summary),
             ages=ages_table(run_ages(run), summary.stages["end_to_end"]),
             latency_pictures=latency_pictures,
             timeline=timeline,
             timeline_notes=[*sawtooth_notes(decisions, vehicle), OUTLIER_NOTE],
             slowest=None if slowest is None else slowest[0],
             slowest_links=[] if slowest is None else [_link(view, *each) for each in slowest[1]],
-            episodes=episodes_table(run, MAX_LISTED),
+            episodes=run_tables.episodes_table(run, MAX_LISTED),
             flights=flights,
             flown=len(run.episodes),
             configuration=json.dumps(run.info.config, indent=2, ensure_ascii=False),
-            provenance=provenance_facts(run.info.machine, run.info.git, run.info.versions),
+            provenance=document.provenance_facts(run.info.machine, run.info.git, run.info.versions),
         )
     )
-    path = folder / REPORT_FILE
+    path = folder / document.REPORT_FILE
     replace_file(path, page.encode())
     return path
 
@@ -197,7 +183,7 @@ def _scores_title(view: ShownFlights) -> str:
     return f"{BEST} best of {len(view.policy.actions)} actions and their {view.policy.scores_are}s"
 
 
-def run_headlines(run: LoadedRun, summary: RunSummary) -> list[Headline]:
+def run_headlines(run: LoadedRun, summary: RunSummary) -> list[document.Headline]:
     """Return the figures that answer the question: how late, how well."""
     q = summary.quality
     end_to_end = summary.stages["end_to_end"]
@@ -205,7 +191,7 @@ def run_headlines(run: LoadedRun, summary: RunSummary) -> list[Headline]:
     origin = "modelled" if summary.modelled else run.info.setup.injection.origin
     return [
         *(
-            estimate_headline(title, estimate.scaled(scale), unit, digits=digits)
+            document.estimate_headline(title, estimate.scaled(scale), unit, digits=digits)
             for title, estimate, scale, unit, digits in (
                 ("success rate", q.success_rate, 100.0, "%", rate_digits(q.success_rate)),
                 ("flight time", q.flight_time_s, 1.0, "s", 1),
@@ -213,6 +199,8 @@ def run_headlines(run: LoadedRun, summary: RunSummary) -> list[Headline]:
                 ("energy", q.energy_j, 1e-3, "kJ", 1),
             )
         ),
-        Headline("t2, median", ms(t2.p50, 1), "ms", f"{origin}, n = {t2.n:,}"),
-        Headline("end to end, median", ms(end_to_end.p50, 1), "ms", f"n = {end_to_end.n:,}"),
+        document.Headline("t2, median", ms(t2.p50, 1), "ms", f"{origin}, n = {t2.n:,}"),
+        document.Headline(
+            "end to end, median", ms(end_to_end.p50, 1), "ms", f"n = {end_to_end.n:,}"
+        ),
     ]

@@ -14,6 +14,7 @@ from airl_mav.core.progress import DRAWING, Progress
 from airl_mav.flight.requirements import Requirement
 from airl_mav.flight.statistics import aggregate
 from airl_mav.rehearsal.run_folder import LoadedRun, load
+from airl_mav.report import run_tables
 from airl_mav.report.arenas import arenas_of, vehicle_of
 from airl_mav.report.conduct import conduct_table
 from airl_mav.report.document import print_verdict
@@ -22,13 +23,6 @@ from airl_mav.report.forensics.evidence import ranked
 from airl_mav.report.forensics.worst import EXAMINED
 from airl_mav.report.run_page import build_page
 from airl_mav.report.run_summary import summarize_run
-from airl_mav.report.run_tables import (
-    episodes_table,
-    latency_table,
-    quality_table,
-    real_time_table,
-    setup_rows,
-)
 from airl_mav.report.shown_flights import shown
 from airl_mav.report.table import count_outcomes, print_facts, print_table
 from airl_mav.report.verdict import (
@@ -90,18 +84,18 @@ def print_report(
     console.print()
     summary, feeds = summarize_run(run), not run.info.setup.computer_on_ground
     flights = count_outcomes([episode.outcome for episode in run.episodes])
-    print_facts([*setup_rows(run), ("flights", flights)], console)
+    print_facts([*run_tables.setup_rows(run), ("flights", flights)], console)
     views = [
-        latency_table(summary),
-        episodes_table(run, MAX_LISTED),
-        quality_table(summary, computer=feeds),
+        run_tables.latency_table(summary),
+        run_tables.episodes_table(run, MAX_LISTED),
+        run_tables.quality_table(summary, computer=feeds),
     ]
     if (conduct := conduct_table(run, summary)) is not None:
         views.append(conduct)
     if (faults := faults_table(run)) is not None:
         views.append(faults)
     if summary.timed:
-        views.append(real_time_table(run, summary))
+        views.append(run_tables.real_time_table(run, summary))
     for view in views:
         console.print()
         print_table(view, console)

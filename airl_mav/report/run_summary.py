@@ -4,15 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from airl_mav.flight.statistics import (
-    AVERAGED,
-    Aggregate,
-    Estimate,
-    aggregate,
-    known,
-    median_of,
-    successful,
-)
+from airl_mav.flight import statistics
 from airl_mav.latency.percentiles import Summary, summarize
 from airl_mav.latency.stages import (
     ALL_STAGES,
@@ -41,8 +33,8 @@ class RunSummary:
     """By stage key."""
     samples: dict[str, Samples]
     """Raw durations behind them [µs]."""
-    quality: Aggregate
-    medians: dict[str, Estimate]
+    quality: statistics.Aggregate
+    medians: dict[str, statistics.Estimate]
     """Of the same flights as the means of `quality`, by its field."""
     modelled: bool
     """Times come from a model and were not measured: level gym."""
@@ -61,12 +53,14 @@ def summarize_run(run: LoadedRun) -> RunSummary:
     """Work out the figures of a run."""
     samples = pool(stage_samples(stamps) for stamps in run.latency.values())
     stages = {stage.key: summarize(samples[stage.key]) for stage in ALL_STAGES}
-    good = successful(run.episodes)
+    good = statistics.successful(run.episodes)
     return RunSummary(
         stages=stages,
         samples=samples,
-        quality=aggregate(run.episodes),
-        medians={name: median_of(known(good, name)) for name in AVERAGED},
+        quality=statistics.aggregate(run.episodes),
+        medians={
+            name: statistics.median_of(statistics.known(good, name)) for name in statistics.AVERAGED
+        },
         modelled=run.info.setup.level == "gym",
         timed=run.info.setup.level not in ("gym", "lockstep"),
     )

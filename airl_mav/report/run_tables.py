@@ -17,6 +17,7 @@ from airl_mav.flight.statistics import NO_ESTIMATE, Estimate
 from airl_mav.latency.percentiles import Summary, summarize
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.rehearsal.run_folder import EPISODES_FILE, TICK_LATENESS, LoadedRun
+from airl_mav.report import table
 from airl_mav.report.measures import (
     COMPUTER_ENERGY,
     DISTANCE,
@@ -30,18 +31,6 @@ from airl_mav.report.measures import (
     rate_digits,
 )
 from airl_mav.report.run_summary import RunSummary
-from airl_mav.report.table import (
-    DURATION_COLUMNS,
-    NONE,
-    OUTCOME_LABELS,
-    TOO_FEW_CELL,
-    TOO_FEW_NOTE,
-    Column,
-    TableView,
-    duration_cells,
-    ms,
-    percentile_cell,
-)
 
 BYTES_PER_MIB = 1 << 20
 
@@ -80,17 +69,17 @@ def _part(part: Part) -> str:
     return f"{part.name} – {part.description}" if part.description else part.name
 
 
-def latency_table(summary: RunSummary) -> TableView:
+def latency_table(summary: RunSummary) -> table.TableView:
     """Return the latencies by stage."""
     columns = (
-        Column("stage", number=False),
-        *DURATION_COLUMNS,
-        Column("from → to", number=False, page_only=True),
+        table.Column("stage", number=False),
+        *table.DURATION_COLUMNS,
+        table.Column("from → to", number=False, page_only=True),
     )
     rows, short = [], False
     for stage in summary.shown_stages:
-        cells = duration_cells(summary.stages[stage.key])
-        short = short or TOO_FEW_CELL in cells
+        cells = table.duration_cells(summary.stages[stage.key])
+        short = short or table.TOO_FEW_CELL in cells
         rows.append((stage.title, *cells, stage.meaning))
     notes = ["Milliseconds of simulated time."]
     if summary.modelled:
@@ -99,8 +88,8 @@ def latency_table(summary: RunSummary) -> TableView:
             "drawn from the distribution named above."
         )
     if short:
-        notes.append(TOO_FEW_NOTE)
-    return TableView("latency", "Decision latency", columns, tuple(rows), tuple(notes))
+        notes.append(table.TOO_FEW_NOTE)
+    return table.TableView("latency", "Decision latency", columns, tuple(rows), tuple(notes))
 
 
 def failures_first(episodes: Sequence[EpisodeRecord], most: int) -> list[EpisodeRecord]:
@@ -109,22 +98,22 @@ def failures_first(episodes: Sequence[EpisodeRecord], most: int) -> list[Episode
     return sorted(ranked[:most], key=lambda e: e.index)
 
 
-def episodes_table(run: LoadedRun, most: int | None = None) -> TableView:
+def episodes_table(run: LoadedRun, most: int | None = None) -> table.TableView:
     """Return the quality of each flight, or of at most so many, those that failed first."""
     feeds = not run.info.setup.computer_on_ground
     columns = (
-        Column("#"),
-        Column("seed"),
-        Column("outcome", number=False),
-        Column("time", "s"),
-        Column("distance", "m"),
-        Column("energy", "kJ"),
-        Column("speed", "m/s"),
-        Column("top speed", "m/s", page_only=True),
-        *([Column("computer", "J", page_only=True)] if feeds else []),
-        Column("take-off", "s, kJ", page_only=True),
-        Column("battery", "%", page_only=True),
-        Column("why", number=False, page_only=True),
+        table.Column("#"),
+        table.Column("seed"),
+        table.Column("outcome", number=False),
+        table.Column("time", "s"),
+        table.Column("distance", "m"),
+        table.Column("energy", "kJ"),
+        table.Column("speed", "m/s"),
+        table.Column("top speed", "m/s", page_only=True),
+        *([table.Column("computer", "J", page_only=True)] if feeds else []),
+        table.Column("take-off", "s, kJ", page_only=True),
+        table.Column("battery", "%", page_only=True),
+        table.Column("why", number=False, page_only=True),
     )
     total = len(run.episodes)
     shown = run.episodes if most is None else failures_first(run.episodes, most)
@@ -136,14 +125,14 @@ def episodes_table(run: LoadedRun, most: int | None = None) -> TableView:
         notes.append(
             f"{len(shown)} of {total:,} flights, those that failed first; all: {EPISODES_FILE}."
         )
-    return TableView("episodes", "Flights", columns, rows, tuple(notes))
+    return table.TableView("episodes", "Flights", columns, rows, tuple(notes))
 
 
 def _episode_row(episode: EpisodeRecord, *, computer: bool) -> tuple[str, ...]:
     """Return an episode's cells, with the energy of its `computer` or without."""
     q = episode.quality
     figures = (
-        (NONE,) * (6 + computer)
+        (table.NONE,) * (6 + computer)
         if q is None
         else (
             f"{q.flight_time_s:.2f}",
@@ -156,25 +145,25 @@ def _episode_row(episode: EpisodeRecord, *, computer: bool) -> tuple[str, ...]:
         )
     )
     battery = episode.battery_remaining
-    left = NONE if battery is None else f"{100.0 * battery:.1f}"
+    left = table.NONE if battery is None else f"{100.0 * battery:.1f}"
     why = "; ".join([episode.reason, *episode.notes])
-    label = OUTCOME_LABELS[episode.outcome]
+    label = table.OUTCOME_LABELS[episode.outcome]
     return (f"{episode.index}", f"{episode.seed}", label, *figures, left, why)
 
 
 def _kilojoules(joules: float | None) -> str:
-    return NONE if joules is None else f"{joules / 1e3:.2f}"
+    return table.NONE if joules is None else f"{joules / 1e3:.2f}"
 
 
-def quality_table(summary: RunSummary, *, computer: bool = True) -> TableView:
+def quality_table(summary: RunSummary, *, computer: bool = True) -> table.TableView:
     """Return the flight quality with intervals; `computer` = its energy is the vehicle's."""
     columns = (
-        Column("measure", number=False),
-        Column("value"),
-        Column("95 % interval"),
-        Column("median"),
-        Column("95 % interval", page_only=True),
-        Column("n"),
+        table.Column("measure", number=False),
+        table.Column("value"),
+        table.Column("95 % interval"),
+        table.Column("median"),
+        table.Column("95 % interval", page_only=True),
+        table.Column("n"),
     )
     q = summary.quality
     rate = replace(SUCCESS_RATE, digits=rate_digits(q.success_rate))
@@ -199,22 +188,24 @@ def quality_table(summary: RunSummary, *, computer: bool = True) -> TableView:
         )
     if 1 < q.flight_time_s.n < FEW_FLIGHTS:
         notes.append(f"Bootstrap intervals of fewer than {FEW_FLIGHTS} flights are too narrow.")
-    return TableView("quality", "Quality of flight", columns, rows, tuple(notes))
+    return table.TableView("quality", "Quality of flight", columns, rows, tuple(notes))
 
 
 def _estimate_row(measure: Measure, mean: Estimate, median: Estimate) -> tuple[str, ...]:
     """Return an estimate's cells."""
 
     def interval(of: Estimate) -> str:
-        return NONE if of.low is None else f"{measure.plain(of.low)} … {measure.plain(of.high)}"
+        return (
+            table.NONE if of.low is None else f"{measure.plain(of.low)} … {measure.plain(of.high)}"
+        )
 
     value, middle = measure.plain(mean.value, unit=True), measure.plain(median.value)
     return measure.title, value, interval(mean), middle, interval(median), f"{mean.n}"
 
 
-def real_time_table(run: LoadedRun, summary: RunSummary) -> TableView:
+def real_time_table(run: LoadedRun, summary: RunSummary) -> table.TableView:
     """Return real-time pace and the companion's resource use."""
-    columns = (Column("measure", number=False), Column("value"), Column("n"))
+    columns = (table.Column("measure", number=False), table.Column("value"), table.Column("n"))
     nothing: NDArray[np.int64] = np.zeros(0, np.int64)
     lateness = [stamps.get(TICK_LATENESS, nothing) for stamps in run.latency.values()]
     accepted = [stamps["accepted_us"] for stamps in run.latency.values() if "accepted_us" in stamps]
@@ -223,16 +214,16 @@ def real_time_table(run: LoadedRun, summary: RunSummary) -> TableView:
     slipped_us = sum(episode.slipped_us for episode in run.episodes)
     uses = [e.companion_use for e in run.episodes if e.companion_use]
     if run.info.setup.level == "flight":
-        return TableView("real-time", "Companion", columns, tuple(_use_rows(uses)))
+        return table.TableView("real-time", "Companion", columns, tuple(_use_rows(uses)))
     rows = [
         *_tail_rows("tick lateness", summarize(np.concatenate([nothing, *lateness]))),
         ("real-time factor", _real_time_factor(run), flights),
-        ("simulated time given up", f"{ms(slipped_us)} ms", flights),
+        ("simulated time given up", f"{table.ms(slipped_us)} ms", flights),
         *_tail_rows("setpoint → motor", summary.stages["setpoint_to_motor"]),
         ("setpoints never accepted", f"{unmatched:,}", f"{sum(map(len, accepted)):,}"),
         *_use_rows(uses),
     ]
-    return TableView("real-time", "Real time", columns, tuple(rows))
+    return table.TableView("real-time", "Real time", columns, tuple(rows))
 
 
 def _use_rows(uses: Sequence[ProcessUse]) -> list[tuple[str, ...]]:
@@ -240,18 +231,18 @@ def _use_rows(uses: Sequence[ProcessUse]) -> list[tuple[str, ...]]:
     if not uses:
         return []
     n, wall_s = f"{len(uses)}", sum(use.wall_s for use in uses)
-    cores = f"{sum(use.cpu_s for use in uses) / wall_s:.2f} cores" if wall_s else NONE
+    cores = f"{sum(use.cpu_s for use in uses) / wall_s:.2f} cores" if wall_s else table.NONE
     mean_s = sum(use.cpu_s for use in uses) / len(uses)
     peaks = [use.peak_memory_bytes for use in uses if use.peak_memory_bytes is not None]
     begun = all(use.peak_since == "begin" for use in uses)
     since = "of any flight" if begun else "since the process began"
     powers = [use.power_w for use in uses if use.power_w is not None]
-    watts = f"{np.mean(powers):.1f} W ({uses[-1].power_source})" if powers else NONE
+    watts = f"{np.mean(powers):.1f} W ({uses[-1].power_source})" if powers else table.NONE
     return [
         ("companion, processor time a flight", f"{mean_s:.2f} s, {cores}", n),
         (
             f"companion, greatest memory {since}",
-            f"{max(peaks) / BYTES_PER_MIB:.0f} MiB" if peaks else NONE,
+            f"{max(peaks) / BYTES_PER_MIB:.0f} MiB" if peaks else table.NONE,
             f"{len(peaks)}",
         ),
         ("mean power of the machine", watts, f"{len(powers)}"),
@@ -262,12 +253,12 @@ def _tail_rows(title: str, summary: Summary) -> list[tuple[str, ...]]:
     """Return median, p99 and maximum of a set of durations as rows; one row when there is none."""
     n = summary.n
     if not n:
-        return [(title, NONE, "0")]
-    p99 = percentile_cell(summary.p99, n)
+        return [(title, table.NONE, "0")]
+    p99 = table.percentile_cell(summary.p99, n)
     return [
-        (f"{title}, p50", f"{ms(summary.p50)} ms", f"{n:,}"),
-        (f"{title}, p99", p99 if p99 == TOO_FEW_CELL else f"{p99} ms", f"{n:,}"),
-        (f"{title}, max", f"{ms(summary.max)} ms", f"{n:,}"),
+        (f"{title}, p50", f"{table.ms(summary.p50)} ms", f"{n:,}"),
+        (f"{title}, p99", p99 if p99 == table.TOO_FEW_CELL else f"{p99} ms", f"{n:,}"),
+        (f"{title}, max", f"{table.ms(summary.max)} ms", f"{n:,}"),
     ]
 
 

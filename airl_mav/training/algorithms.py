@@ -14,12 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from airl_mav.core.errors import UsageError
 from airl_mav.policy.runtime import first_line
-from airl_mav.training.config import (
-    AlgorithmSpec,
-    NetworkSpec,
-    check_actions,
-    check_fields,
-)
+from airl_mav.training import config
 from airl_mav.training.networks import policy_arguments, to_channels_last
 from airl_mav.training.table import ALGORITHMS, Algorithm
 
@@ -30,8 +25,8 @@ ROLLOUT = 4096
 
 
 def make_model(
-    algorithm: AlgorithmSpec,
-    network: NetworkSpec,
+    algorithm: config.AlgorithmSpec,
+    network: config.NetworkSpec,
     vec_env: VecEnv,
     seed: int,
     tensorboard_log: str | None = None,
@@ -47,8 +42,8 @@ def make_model(
     row = ALGORITHMS[algorithm.name]
     learner = _algorithm_class(algorithm.name)
     discrete = isinstance(vec_env.action_space, spaces.Discrete)
-    check_fields(algorithm)
-    check_actions(algorithm.name, "discrete" if discrete else "continuous")
+    config.check_fields(algorithm)
+    config.check_actions(algorithm.name, "discrete" if discrete else "continuous")
     arguments = _arguments(algorithm, row, vec_env.num_envs)
     network_arguments = policy_arguments(network)
     network_arguments |= {k: arguments.pop(k) for k in row.to_policy if k in arguments}
@@ -81,7 +76,7 @@ def _algorithm_class(name: str) -> Any:
         ) from None
 
 
-def _arguments(spec: AlgorithmSpec, row: Algorithm, vehicles: int) -> dict[str, Any]:
+def _arguments(spec: config.AlgorithmSpec, row: Algorithm, vehicles: int) -> dict[str, Any]:
     """Return the constructor's arguments, those of `options` included."""
     arguments = {argument: getattr(spec, name) for name, argument in row.fields.items()}
     if spec.learning_rate_final is not None:

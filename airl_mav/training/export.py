@@ -20,31 +20,13 @@ from torch import nn
 
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.plugins import MODELS, load_part
-from airl_mav.policy.action_sets import (
-    BODY_RATES,
-    ActionSpec,
-    continuous_numbers,
-    discrete_actions,
-)
+from airl_mav.policy import action_sets
 from airl_mav.policy.card import PolicyCard, PolicyFacts
 from airl_mav.policy.layouts import GOAL, IN_FLIGHT, VELOCITY, boxes
 from airl_mav.policy.observation_spec import ObservationSpec
 from airl_mav.policy.runtime import first_line
 from airl_mav.profiles.camera_kind import CHANNELS, KINDS
-from airl_mav.training.export_request import (
-    ExportRequest,
-    Normalised,
-    Taken,
-    load_normalisation,
-    normalised_keys,
-)
-from airl_mav.training.onnx_export import (
-    TOLERANCE,
-    export_network,
-    memory_of,
-    random_inputs,
-    random_memory,
-)
+from airl_mav.training import export_request, onnx_export
 from airl_mav.training.recurrent import RecurrentNetwork, RecurrentOfAny
 
 DEPTH = "depth"
@@ -166,9 +148,9 @@ def network_of(
     keys = tuple(keys)
 
     def normalised(inner: nn.Module) -> nn.Module:
-        if learned is None or not normalised_keys(learned):
+        if learned is None or not export_request.normalised_keys(learned):
             return inner
-        return Normalised(inner, learned)
+        return export_request.Normalised(inner, learned)
 
     def network(inner: nn.Module) -> nn.Module:
         inner = normalised(inner)
@@ -215,7 +197,7 @@ def _further_keys(seen: spaces.Space[Any]) -> tuple[str, ...]:
 def check_spaces(
     model: BaseAlgorithm,
     spec: ObservationSpec,
-    actions: ActionSpec,
+    actions: action_sets.ActionSpec,
     normalised: Collection[str] = (),
 ) -> None:
     """Raise UsageError unless a model takes a layout's arrays and gives an action set.
@@ -244,7 +226,7 @@ def check_spaces(
         if not spec.in_flight and IN_FLIGHT in parts:
             told += f". What {IN_FLIGHT} tells is told by --like CONFIGURATION"
         raise UsageError(told)
-    space, count = model.action_space, discrete_actions(actions)
+    space, count = model.action_space, action_sets.discrete_actions(actions)
     if count is not None:
         if not (isinstance(space, spaces.Discrete) and space.n == count and space.start == 0):
             raise UsageError(
@@ -252,17 +234,17 @@ def check_spaces(
             )
     elif not (
         isinstance(space, spaces.Box)
-        and space.shape == (continuous_numbers(actions),)
+        and space.shape == (action_sets.continuous_numbers(actions),)
         and (space.low == -1.0).all()
         and (space.high == 1.0).all()
     ):
         raise UsageError(
             f"action space {space}; accepted with {actions.set!r}: "
-            f"Box(-1.0, 1.0, ({continuous_numbers(actions)},), float32)"
+            f"Box(-1.0, 1.0, ({action_sets.continuous_numbers(actions)},), float32)"
         )
 
 
-def export(asked: ExportRequest, command: str) -> PolicyCard:
+def export(asked: export_request.ExportRequest, command: str) -> PolicyCard:
     """Export the .zip of an SB3 model, or a plain module, as a policy that flies; return its card.
 
     A .zip holds pickled Python objects and a module is code: export only from people you trust.
@@ -282,12 +264,12 @@ def export(asked: ExportRequest, command: str) -> PolicyCard:
     if asked.own_module:
         facts = asked.facts(command)
         module = load_module(asked.model, asked.weights, tuple(boxes(facts.observation)))
-        write = partial(export_network, module, folder=out, with_torch=asked.with_torch)
+        write = partial(onnx_export.export_network, module, folder=out, with_torch=asked.with_torch)
     else:
         learner = load_sb3(Path(asked.model), asked.algorithm or "")
         facts = asked.facts(command, taken_by(learner))
         path = asked.vec_normalize
-        learned = None if path is None else load_normalisation(path)
+        learned = None if path is None else export_request.load_normalisation(path)
         write = partial(
             export_sb3, learner, folder=out, with_torch=asked.with_torch, learned=learned
         )
@@ -299,7 +281,7 @@ def export(asked: ExportRequest, command: str) -> PolicyCard:
         raise UsageError(f"{out}: {error.strerror}") from None
 
 
-def taken_by(model: BaseAlgorithm) -> Taken:
+def taken_by(model: BaseAlgorithm) -> export_request.Taken:
     """Return what a model's spaces say of the image and the action set."""
     seen, space = model.observation_space, model.action_space
     images = seen.spaces if isinstance(seen, spaces.Dict) else {}
@@ -307,13 +289,15 @@ def taken_by(model: BaseAlgorithm) -> Taken:
     shape = None if kind is None else images[kind].shape
     actions: str | None = None
     if isinstance(space, spaces.Box):
-        actions = {3: "velocity3d", 4: BODY_RATES}.get(len(space.low), "velocity")
+        actions = {3: "velocity3d", 4: action_sets.BODY_RATES}.get(len(space.low), "velocity")
     goal = images.get(GOAL)
     tells_height = goal is not None and goal.shape == (4,)
     if kind is None or shape is None or len(shape) != 3:
-        return Taken(actions=actions)
+        return export_request.Taken(actions=actions)
     image = f"{shape[2]}x{shape[1]}"
-    return Taken(image, shape[0] // CHANNELS[kind], actions, kind, tells_height or None)
+    return export_request.Taken(
+        image, shape[0] // CHANNELS[kind], actions, kind, tells_height or None
+    )
 
 
 def load_module(name: str, weights: Path | None, keys: Sequence[str] = USUAL) -> nn.Module:
@@ -383,13 +367,13 @@ def export_sb3(
     Raises:
         UsageError: The model's spaces do not fit the facts, or it cannot be exported.
     """
-    check_spaces(model, facts.observation, facts.actions, normalised_keys(learned))
+    check_spaces(model, facts.observation, facts.actions, export_request.normalised_keys(learned))
     network = network_of(model, tuple(boxes(facts.observation)), learned)
     training = model.policy.training
     model.policy.set_training_mode(False)
     try:
         _check_decisions(model, network, facts, learned)
-        return export_network(network, facts, folder, with_torch=with_torch)
+        return onnx_export.export_network(network, facts, folder, with_torch=with_torch)
     finally:
         model.policy.set_training_mode(training)
 
@@ -437,8 +421,8 @@ def _check_decisions(
 ) -> None:
     """Raise UsageError unless the network decides as the model's own `predict` does."""
     rng, device = np.random.default_rng(2), model.device
-    seen = random_inputs(facts.observation, CHECKED, rng)
-    memory = random_memory(memory_of(network), CHECKED, rng)
+    seen = onnx_export.random_inputs(facts.observation, CHECKED, rng)
+    memory = onnx_export.random_memory(onnx_export.memory_of(network), CHECKED, rng)
     # sb3-contrib has the layers first, then the rows.
     state = tuple(array.swapaxes(0, 1) for array in memory.values()) or None
     shown: Any = seen if learned is None else learned.normalize_obs(seen)
@@ -447,8 +431,8 @@ def _check_decisions(
         arrays = [*(seen[key] for key in boxes(facts.observation)), *memory.values()]
         found = network(*(torch.from_numpy(array).to(device) for array in arrays))
         outputs = (found[0] if memory else found).cpu().numpy()
-    slack = TOLERANCE * max(1.0, float(np.abs(outputs).max()))
-    if discrete_actions(facts.actions) is None:
+    slack = onnx_export.TOLERANCE * max(1.0, float(np.abs(outputs).max()))
+    if action_sets.discrete_actions(facts.actions) is None:
         same = np.abs(outputs - decided).max() <= slack
     else:
         # Of two that are as good as each other either may win.

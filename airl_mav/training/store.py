@@ -17,17 +17,8 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
+from airl_mav.core import files
 from airl_mav.core.errors import UsageError
-from airl_mav.core.files import (
-    append_lines,
-    json_line,
-    read_json,
-    read_lines,
-    read_typed,
-    replace_file,
-    typed,
-    write_json,
-)
 from airl_mav.core.provenance import provenance
 from airl_mav.training.config import TrainingConfig
 
@@ -108,7 +99,7 @@ class TrainingFolder:
         if not folder.begun:
             plain = config.model_dump(mode="json", exclude_none=True)
             about = {"schema": SCHEMA, **provenance(command), "config": plain}
-            write_json(path / CONFIG_FILE, about)
+            files.write_json(path / CONFIG_FILE, about)
             return folder
         if not resume:
             raise UsageError(
@@ -133,22 +124,22 @@ class TrainingFolder:
 
     def about(self) -> dict[str, Any]:
         """Return what `train.json` holds. Raises UsageError when there is no run."""
-        return read_json(self.path / CONFIG_FILE, SCHEMA, "training run")
+        return files.read_json(self.path / CONFIG_FILE, SCHEMA, "training run")
 
     def evaluations(self) -> list[Evaluation]:
         """Return the evaluations so far; a line cut short by a kill is passed over."""
-        lines = read_lines(self.path / EVALUATIONS_FILE, None)
-        return [typed(_EVALUATION, data, place) for place, data in lines]
+        lines = files.read_lines(self.path / EVALUATIONS_FILE, None)
+        return [files.typed(_EVALUATION, data, place) for place, data in lines]
 
     def add_evaluation(self, evaluation: Evaluation) -> None:
         """Append a line; on return it is on the disk."""
-        append_lines(self.path / EVALUATIONS_FILE, [asdict(evaluation)])
+        files.append_lines(self.path / EVALUATIONS_FILE, [asdict(evaluation)])
 
     def forget_after(self, steps: int) -> None:
         """Drop evaluations later than a checkpoint: going on from it will make them again."""
         kept = [each for each in self.evaluations() if each.steps <= steps]
-        replace_file(
-            self.path / EVALUATIONS_FILE, b"".join(json_line(asdict(each)) for each in kept)
+        files.replace_file(
+            self.path / EVALUATIONS_FILE, b"".join(files.json_line(asdict(each)) for each in kept)
         )
 
     def best(self) -> Evaluation | None:
@@ -156,7 +147,7 @@ class TrainingFolder:
         file = self.path / "best" / BEST_FILE
         if not file.exists() or not self.best_model.exists():
             return None
-        return read_typed(file, _EVALUATION, None, "training run")
+        return files.read_typed(file, _EVALUATION, None, "training run")
 
     def zone(self, zone: int) -> Path:
         """Return the folder of what is kept of a curriculum zone."""
@@ -165,5 +156,5 @@ class TrainingFolder:
     def save_best(self, model: bytes, evaluation: Evaluation) -> None:
         """Save the best weights, then their evaluation."""
         self.best_model.parent.mkdir(exist_ok=True)
-        replace_file(self.best_model, model)
-        write_json(self.best_model.parent / BEST_FILE, asdict(evaluation))
+        files.replace_file(self.best_model, model)
+        files.write_json(self.best_model.parent / BEST_FILE, asdict(evaluation))

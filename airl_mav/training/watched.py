@@ -27,23 +27,9 @@ from airl_mav.policy.action_sets import commands, discrete_actions
 from airl_mav.policy.layouts import newest_frame
 from airl_mav.policy.observation_spec import Encoded
 from airl_mav.training.store import Evaluation, TrainingProgress
+from airl_mav.view import messages
 from airl_mav.view.ends import Request, ViewEnds
 from airl_mav.view.feed import Feed
-from airl_mav.view.messages import (
-    ArenaShown,
-    Decided,
-    Episode,
-    Flight,
-    Image,
-    Message,
-    Phase,
-    Picture,
-    Said,
-    Trained,
-    Vehicle,
-    VehicleShape,
-    shape_of,
-)
 from airl_mav.view.pace import Pace
 from airl_mav.view.shown import OFFBOARD
 
@@ -97,8 +83,8 @@ class Moment(NamedTuple):
     """What is shown at a time of a flight [simulated µs since its start]."""
 
     time_us: int
-    message: Message
-    image: Image | None = None
+    message: messages.Message
+    image: messages.Image | None = None
 
 
 class _Standing(NamedTuple):
@@ -122,7 +108,7 @@ class WatchedTraining(TrainingProgress):
         self._count = 0
         self._standing = _Standing()
         self._newest: deque[Taped] = deque(maxlen=1)
-        self._said: deque[Said] = deque(maxlen=16)
+        self._said: deque[messages.Said] = deque(maxlen=16)
         self._feed, self._pace = Feed(ends), Pace(ends, SPEED)
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._run, name="watched training", daemon=True)
@@ -174,7 +160,7 @@ class WatchedTraining(TrainingProgress):
         so_far = ", the best so far" if best else ""
         text = f"evaluation after {evaluation.steps:,} decisions: {evaluation.success_rate:.1%}"
         text += f" of {evaluation.episodes} reach the goal{so_far}"
-        self._said.append(Said(time_us=None, severity=INFO, text=text))
+        self._said.append(messages.Said(time_us=None, severity=INFO, text=text))
         self._onwards.evaluated(evaluation, best=best)
 
     # --- the view's side, in a thread
@@ -198,13 +184,13 @@ class WatchedTraining(TrainingProgress):
             if self._ended.is_set():
                 return now_us
             message = moment.message
-            if isinstance(message, Trained):
+            if isinstance(message, messages.Trained):
                 steps, success, zone = self._standing
                 message = message.model_copy(
                     update={"steps": steps, "success": success, "zone": zone}
                 )
             self._feed.send(message, moment.image)
-            if isinstance(message, Decided):
+            if isinstance(message, messages.Decided):
                 self._pace.decided()
                 while self._said:
                     self._feed.send(self._said.popleft())
@@ -255,30 +241,34 @@ class Reflight:
     def _now_us(self) -> int:
         return int(self.navigation.whole_truth().fleet.time_us[0])
 
-    def _beginning(self, taped: Taped, began_us: int) -> list[Message]:
+    def _beginning(self, taped: Taped, began_us: int) -> list[messages.Message]:
         navigation = self.navigation
         arena = navigation.arenas[0]
         assert arena is not None  # noqa: S101 - its episode has begun
         goal = arena.goal_point
         return [
-            Flight(index=taped.number, seed=taped.seed, goal=goal),
-            Episode(
+            messages.Flight(index=taped.number, seed=taped.seed, goal=goal),
+            messages.Episode(
                 seed=taped.seed,
                 started_us=began_us,
-                arena=ArenaShown.of(arena),
-                vehicle=VehicleShape.of(navigation.vehicle),
+                arena=messages.ArenaShown.of(arena),
+                vehicle=messages.VehicleShape.of(navigation.vehicle),
                 goal=goal,
                 goal_radius_m=self._environment.episode.goal_radius_m,
             ),
-            Phase(time_us=began_us, phase="navigating"),
+            messages.Phase(time_us=began_us, phase="navigating"),
         ]
 
     def _picture(self, began_us: int) -> Moment:
         image = self.navigation.cameras.image[0].copy()
         now_us = self._now_us()
-        return Moment(now_us, Picture(captured_us=began_us + now_us, shape=shape_of(image)), image)
+        return Moment(
+            now_us,
+            messages.Picture(captured_us=began_us + now_us, shape=messages.shape_of(image)),
+            image,
+        )
 
-    def _as_seen(self, seen: Encoded) -> Image:
+    def _as_seen(self, seen: Encoded) -> messages.Image:
         """Return the network's image for the view: depth [mm], or colours."""
         spec = self.navigation.observation
         image = newest_frame(spec, seen)
@@ -286,10 +276,10 @@ class Reflight:
             return image if image.ndim == 3 else image[..., None]
         far_mm = self.navigation.observation.range_m * MM_PER_M
         # 0 would be what no depth is known of.
-        depth: Image = np.maximum(np.rint(image * (far_mm / 255.0)), 1.0).astype(np.uint16)
+        depth: messages.Image = np.maximum(np.rint(image * (far_mm / 255.0)), 1.0).astype(np.uint16)
         return depth
 
-    def _decided(self, image: Image, began_us: int) -> Moment:
+    def _decided(self, image: messages.Image, began_us: int) -> Moment:
         """Return the newest decision, at the time at which it began."""
         record = self._trace.latency(0)
         stamp = {name: int(column[-1]) for name, column in record.items() if column.ndim == 1}
@@ -303,7 +293,7 @@ class Reflight:
             held_s = episode.hold_s + episode.hover_after_s
             expires_us = began_us + sent + round(held_s * US_PER_S)
         forward, right, down, turn = record["setpoint"][-1].astype(float).tolist()
-        message = Decided(
+        message = messages.Decided(
             captured_us=began_us + stamp["capture_us"],
             began_us=began_us + began,
             ready_us=began_us + ready,
@@ -311,7 +301,7 @@ class Reflight:
             expires_us=expires_us,
             setpoint=(forward, right, down, turn),
             compensated=self._environment.compensate,
-            shape=shape_of(image),
+            shape=messages.shape_of(image),
         )
         return Moment(began, message, image)
 
@@ -325,7 +315,7 @@ class Reflight:
             text = f"{int(action)} of 0 to {count - 1}"
         return Moment(
             began,
-            Trained(
+            messages.Trained(
                 time_us=began_us + began,
                 action=text,
                 reward=taped.rewards[k],
@@ -339,10 +329,10 @@ class Reflight:
         position: NDArray[np.float64],
         velocity: NDArray[np.float64],
         quaternion: NDArray[np.float64],
-    ) -> Vehicle:
+    ) -> messages.Vehicle:
         """Return the vehicle at a time; rotors and battery are those at the decision's end."""
         fleet = self.navigation.whole_truth().fleet
-        return Vehicle(
+        return messages.Vehicle(
             time_us=time_us,
             position=tuple(position.tolist()),
             velocity=tuple(velocity.tolist()),
@@ -359,6 +349,6 @@ class Reflight:
         text = f"episode {taped.number}: {taped.outcome} after {now_us / US_PER_S:.1f} s, return"
         said = f"{text} {sum(taped.rewards):+.3f}"
         return [
-            Moment(now_us, Phase(time_us=began_us + now_us, phase=taped.outcome)),
-            Moment(now_us, Said(time_us=began_us + now_us, severity=INFO, text=said)),
+            Moment(now_us, messages.Phase(time_us=began_us + now_us, phase=taped.outcome)),
+            Moment(now_us, messages.Said(time_us=began_us + now_us, severity=INFO, text=said)),
         ]

@@ -17,13 +17,7 @@ from numpy.typing import NDArray
 from airl_mav.arena.appearance import OBSTACLE
 from airl_mav.arena.geometry import Arena, Bounds, Shape
 from airl_mav.arena.triangles import drawn, standing
-from airl_mav.core.frames import (
-    FRD_FROM_OPTICAL,
-    heading_to_ned,
-    quat_from_euler,
-    quat_multiply,
-    quat_yaw,
-)
+from airl_mav.core import frames
 from airl_mav.core.goals import goal_height_m
 from airl_mav.profiles.vehicle import CORNERS, COUNTER_CLOCKWISE
 from airl_mav.view.look import (
@@ -187,7 +181,7 @@ class FlightScene:
             fade_distance=400.0,
             position=(*middle, 0.0),
             # Its upper side is the one that looks along its own +z.
-            wxyz=quat_from_euler(math.pi, 0.0, 0.0),
+            wxyz=frames.quat_from_euler(math.pi, 0.0, 0.0),
         )
 
     def _build_arena(self, arena: Arena) -> None:
@@ -280,7 +274,7 @@ class FlightScene:
         half, at = arena.obstacles.half_size[i].tolist(), tuple(arena.obstacles.center[i].tolist())
         name = f"/arena/obstacle/{i}"
         if arena.obstacles.shape[i] == Shape.BOX:
-            turn = quat_from_euler(0.0, 0.0, float(arena.obstacles.yaw[i]))
+            turn = frames.quat_from_euler(0.0, 0.0, float(arena.obstacles.yaw[i]))
             size = tuple(2.0 * extent for extent in half)
             look = {"color": colour, "opacity": opacity}
             return self._add("box", name, dimensions=size, position=at, wxyz=turn, **look)
@@ -314,7 +308,7 @@ class FlightScene:
                 f"/vehicle/arm/{name}",
                 color=self._look.body,
                 dimensions=(2.0 * math.hypot(forward, right), 0.025, 0.02),
-                wxyz=quat_from_euler(0.0, 0.0, math.atan2(side * right, forward)),
+                wxyz=frames.quat_from_euler(0.0, 0.0, math.atan2(side * right, forward)),
             )
         for corner in CORNERS:
             at = (
@@ -332,7 +326,7 @@ class FlightScene:
 
     def _build_camera(self, shape: VehicleShape) -> None:
         pitch, yaw = map(math.radians, (shape.camera_pitch_up_deg, shape.camera_yaw_deg))
-        turn = quat_from_euler(0.0, pitch, yaw)
+        turn = frames.quat_from_euler(0.0, pitch, yaw)
         if shape.camera_projection == "cylindrical":
             # It looks all round: its picture hangs unrolled above the vehicle, ahead in the middle.
             self._camera = self._add(
@@ -342,7 +336,7 @@ class FlightScene:
                 render_width=UNROLLED_M,
                 render_height=UNROLLED_M / shape.camera_aspect,
                 position=(0.0, 0.0, -shape.camera_up_m - FRUSTUM_M),
-                wxyz=FRD_FROM_OPTICAL,
+                wxyz=frames.FRD_FROM_OPTICAL,
             )
             return
         # A fisheye's is drawn as wide as a frustum can be.
@@ -356,7 +350,7 @@ class FlightScene:
             thickness=0.012,
             color=FLOWN,
             position=(shape.camera_forward_m, shape.camera_right_m, -shape.camera_up_m),
-            wxyz=quat_multiply(turn, FRD_FROM_OPTICAL),
+            wxyz=frames.quat_multiply(turn, frames.FRD_FROM_OPTICAL),
         )
 
     # --- every time
@@ -367,7 +361,7 @@ class FlightScene:
         self._place.position = at
         self._turns += BLADE_TURN_RAD * self._rotor_turn * np.array(vehicle.rotors)
         for blade, turn in zip(self._blades, self._turns.tolist(), strict=True):
-            blade.wxyz = quat_from_euler(0.0, 0.0, turn)
+            blade.wxyz = frames.quat_from_euler(0.0, 0.0, turn)
         if shown.arena is not None and self._movers:
             centers = shown.arena.centers_at(vehicle.time_us - episode.started_us)
             for node, center in zip(self._movers, centers[shown.arena.n_static :], strict=True):
@@ -377,7 +371,7 @@ class FlightScene:
         self._flown.points = arrow(np.array(vehicle.velocity))
         command = shown.command if self._look.whole else None
         if command is not None:
-            command = heading_to_ned(command, quat_yaw(np.array(vehicle.quaternion)))
+            command = frames.heading_to_ned(command, frames.quat_yaw(np.array(vehicle.quaternion)))
         self._commanded.points = arrow(command)
         self._extend_trail(shown.trail)
 

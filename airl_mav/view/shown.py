@@ -12,18 +12,7 @@ from numpy.typing import NDArray
 from airl_mav.arena.geometry import Arena
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.goals import goal_distance_m
-from airl_mav.view.messages import (
-    Decided,
-    Episode,
-    Flight,
-    Image,
-    Phase,
-    Picture,
-    Said,
-    Told,
-    Trained,
-    Vehicle,
-)
+from airl_mav.view import messages
 
 STRIP_S = 20.0
 """How much of the past the strip shows [simulated s]."""
@@ -44,51 +33,51 @@ Point = tuple[float, float, float]
 class Shown:
     """All that is drawn."""
 
-    flight: Flight | None = None
+    flight: messages.Flight | None = None
     phase: str = ""
-    texts: deque[Said] = field(default_factory=lambda: deque(maxlen=TEXTS))
-    episode: Episode | None = None
+    texts: deque[messages.Said] = field(default_factory=lambda: deque(maxlen=TEXTS))
+    episode: messages.Episode | None = None
     arena: Arena | None = None
     is_surrounded: bool = True
     """Whether it is known what stands around: not while an arena is being made."""
     episodes: int = 0
     """How many episodes have begun so far: another number is another scene."""
-    vehicle: Vehicle | None = None
+    vehicle: messages.Vehicle | None = None
     trail: list[Point] = field(default_factory=list)
     """Where the vehicle was in this episode, NED [m]."""
-    picture: Image | None = None
+    picture: messages.Image | None = None
     """The camera's newest image."""
-    decided: Decided | None = None
-    decided_image: Image | None = None
+    decided: messages.Decided | None = None
+    decided_image: messages.Image | None = None
     """What the policy saw at that decision."""
-    trained: Trained | None = None
+    trained: messages.Trained | None = None
     """What a training's newest decision came to; None: nothing is trained."""
     decisions: int = 0
     """How many were sent in this episode, as far as they were heard of."""
     ages: deque[tuple[float, float, float]] = field(default_factory=deque)
     """Time since the episode began [s], age of the command and t2 of its decision [ms]."""
 
-    def take(self, message: Told, image: Image | None) -> None:
+    def take(self, message: messages.Told, image: messages.Image | None) -> None:
         """Take in a message, with its image."""
-        if isinstance(message, Vehicle):
+        if isinstance(message, messages.Vehicle):
             self._move(message)
-        elif isinstance(message, Picture):
+        elif isinstance(message, messages.Picture):
             self.picture = image
-        elif isinstance(message, Decided):
+        elif isinstance(message, messages.Decided):
             self.decided, self.decided_image = message, image
             self.decisions += 1
-        elif isinstance(message, Episode):
+        elif isinstance(message, messages.Episode):
             self._begin(message)
-        elif isinstance(message, Phase):
+        elif isinstance(message, messages.Phase):
             self.phase = message.phase
-        elif isinstance(message, Said):
+        elif isinstance(message, messages.Said):
             self.texts.append(message)
-        elif isinstance(message, Trained):
+        elif isinstance(message, messages.Trained):
             self.trained = message
         else:
             self.flight, self.phase = message, "booting"
 
-    def _begin(self, episode: Episode) -> None:
+    def _begin(self, episode: messages.Episode) -> None:
         self.episode = episode
         self.arena = None if episode.arena is None else episode.arena.arena()
         self.episodes += 1
@@ -96,7 +85,7 @@ class Shown:
         self.trail, self.decisions = [], 0
         self.ages.clear()
 
-    def _move(self, vehicle: Vehicle) -> None:
+    def _move(self, vehicle: messages.Vehicle) -> None:
         self.vehicle = vehicle
         if not self.trail or math.dist(self.trail[-1], vehicle.position) >= TRAIL_STEP_M:
             self.trail.append(vehicle.position)

@@ -15,18 +15,9 @@ from airl_mav.latency.samplers import LatencySampler
 from airl_mav.policy.observation import Kinematics
 from airl_mav.prediction.compensator import Compensator
 from airl_mav.scenario.resolved import ResolvedScenario
+from airl_mav.view import messages
 from airl_mav.view.ends import ViewEnds
 from airl_mav.view.feed import Asked, Feed
-from airl_mav.view.messages import (
-    ArenaShown,
-    Decided,
-    Episode,
-    Picture,
-    Steering,
-    Vehicle,
-    VehicleShape,
-    shape_of,
-)
 from companion.pilot import Decided as Decision
 from firmware_sim.autopilot.commander import Phase
 from firmware_sim.simulation import Simulation
@@ -35,12 +26,12 @@ from firmware_sim.simulation import Simulation
 class Hand:
     """What the watchers have set, as one companion flies by it."""
 
-    def __init__(self, newest: Callable[[], Steering], *, compensate: bool) -> None:
+    def __init__(self, newest: Callable[[], messages.Steering], *, compensate: bool) -> None:
         """Take what gives the newest that they ask for, and whether the scenario compensates."""
         self.touched = False
         """Whether a decision of this flight was made otherwise than the scenario says."""
         self._newest = newest
-        self._known = Steering()
+        self._known = messages.Steering()
         self._as_asked = compensate
 
     def t2_us(self) -> int | None:
@@ -123,11 +114,11 @@ class SimulationTap:
         """An episode begins, in an arena."""
         self._vehicle_due = self._picture_due = -1
         self._feed.send(
-            Episode(
+            messages.Episode(
                 seed=seed,
                 started_us=started_us,
-                arena=ArenaShown.of(arena),
-                vehicle=VehicleShape.of(self._scenario.vehicle),
+                arena=messages.ArenaShown.of(arena),
+                vehicle=messages.VehicleShape.of(self._scenario.vehicle),
                 goal=arena.goal_point,
                 goal_radius_m=self._scenario.pilot.goal_radius_m,
             )
@@ -142,7 +133,7 @@ class SimulationTap:
         truth, flight = simulation.truth, simulation.autopilot.flight
         plant = simulation.plant
         self._feed.send(
-            Vehicle(
+            messages.Vehicle(
                 time_us=truth.time_us,
                 position=tuple(truth.position.tolist()),
                 velocity=tuple(truth.velocity.tolist()),
@@ -161,7 +152,9 @@ class SimulationTap:
         if due == self._picture_due:
             return
         self._picture_due = due
-        shown = Picture(captured_us=frame.capture_time_us, shape=shape_of(frame.image))
+        shown = messages.Picture(
+            captured_us=frame.capture_time_us, shape=messages.shape_of(frame.image)
+        )
         self._feed.send(shown, frame.image)
 
     def close(self) -> None:
@@ -178,7 +171,7 @@ class CompanionTap:
     def __init__(self, ends: ViewEnds, scenario: ResolvedScenario) -> None:
         """Connect to a view."""
         self._feed = Feed(ends)
-        self._asked = Asked(ends, Steering())
+        self._asked = Asked(ends, messages.Steering())
         self._scenario = scenario
         self._hand = self._new_hand()
 
@@ -207,7 +200,7 @@ class CompanionTap:
     def decided(self, decision: Decision) -> None:
         """A decision was sent."""
         first, second, third, fourth = (float(number) for number in decision.setpoint)
-        shown = Decided(
+        shown = messages.Decided(
             captured_us=decision.seen.frame.capture_time_us,
             began_us=decision.started_us,
             ready_us=decision.ready_us,
@@ -216,7 +209,7 @@ class CompanionTap:
             setpoint=(first, second, third, fourth),
             commands=self._scenario.pilot.commands,
             compensated=self._scenario.vehicle.compensable and self._hand.compensates(),
-            shape=shape_of(decision.image),
+            shape=messages.shape_of(decision.image),
         )
         self._feed.send(shown, decision.image)
 

@@ -12,13 +12,7 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.ports import LOOPBACK
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import Aircraft, FirmwareName
-from firmware_sim.external.airframe_check import (
-    HITL_OUTPUT,
-    SITL_OUTPUT,
-    ardupilot_airframe,
-    px4_airframe,
-    refuse_untold,
-)
+from firmware_sim.external import airframe_check
 from firmware_sim.external.ardupilot import program as ardupilot_program
 from firmware_sim.external.ardupilot.program import Links, find_arducopter
 from firmware_sim.external.ardupilot.sitl import ArdupilotBridge
@@ -75,7 +69,7 @@ def px4_parts(
     `instance` moves the ports; `bridge` opens the simulator interface on one.
     """
     options = wanted.aircraft.real
-    airframe = px4_airframe(wanted.vehicle, SITL_OUTPUT)
+    airframe = airframe_check.px4_airframe(wanted.vehicle, airframe_check.SITL_OUTPUT)
     program = None if options.px4_dir is None else find_px4(options.px4_dir)
     endpoint = UdpEndpoint(
         (LOOPBACK, px4_program.PAYLOAD_PORT + instance),
@@ -97,8 +91,8 @@ def px4_parts(
 def _ardupilot(wanted: Wanted) -> tuple[Launcher, Endpoint]:
     options, ports = wanted.aircraft.real, wanted.aircraft.ports
     instance = options.instance
-    airframe = ardupilot_airframe(wanted.vehicle)
-    refuse_untold(wanted.vehicle, "ardupilot")
+    airframe = airframe_check.ardupilot_airframe(wanted.vehicle)
+    airframe_check.refuse_untold(wanted.vehicle, "ardupilot")
     where = options.ardupilot_dir
     program = None if where is None else find_arducopter(where)
     # Who is started by us can be told any port.
@@ -122,8 +116,8 @@ def _ardupilot(wanted: Wanted) -> tuple[Launcher, Endpoint]:
 
 def _hitl(wanted: Wanted) -> tuple[Launcher, Endpoint]:
     options = wanted.aircraft.real
-    airframe = px4_airframe(wanted.vehicle, HITL_OUTPUT)
-    refuse_untold(wanted.vehicle, "px4-hitl")
+    airframe = airframe_check.px4_airframe(wanted.vehicle, airframe_check.HITL_OUTPUT)
+    airframe_check.refuse_untold(wanted.vehicle, "px4-hitl")
     router = Router(wanted.bind_ends().by_name(), WallClock())
     try:
         link = BoardLink(router, options.serial or "", options.baud)

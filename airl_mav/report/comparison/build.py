@@ -16,16 +16,7 @@ from airl_mav.flight.statistics import aggregate
 from airl_mav.latency.percentiles import summarize
 from airl_mav.latency.stages import ALL_STAGES, Samples, pool, stage_samples
 from airl_mav.rehearsal.run_folder import LoadedRun, load
-from airl_mav.report.comparison.model import (
-    ComparedRun,
-    Comparison,
-    Contrast,
-    ContrastEntry,
-    Kind,
-    NavigationStart,
-    RunEntry,
-    part_of,
-)
+from airl_mav.report.comparison import model
 from airl_mav.report.run_tables import setup_rows
 
 SHORT_NAME = 14
@@ -43,13 +34,13 @@ MACHINE_TERMS = ("cpu", "os")
 
 def compare(
     runs: Mapping[str, LoadedRun],
-    contrasts: Sequence[ContrastEntry] | None = None,
+    contrasts: Sequence[model.ContrastEntry] | None = None,
     *,
-    kind: Kind = "compare",
+    kind: model.Kind = "compare",
     title: str = "",
     facts: Mapping[str, Any] | None = None,
-    entries: Sequence[RunEntry] = (),
-) -> Comparison:
+    entries: Sequence[model.RunEntry] = (),
+) -> model.Comparison:
     """Compare runs.
 
     Args:
@@ -66,21 +57,21 @@ def compare(
     if not runs:
         raise UsageError(f"no run here; accepted: a {kind} of one run or more")
     by_name = {entry.name: entry for entry in entries}
-    given = [by_name.get(name) or RunEntry(name, str(run.path)) for name, run in runs.items()]
+    given = [by_name.get(name) or model.RunEntry(name, str(run.path)) for name, run in runs.items()]
     for run in runs.values():
         if not run.episodes:
             raise UsageError(f"{run.path}: no flight was finished: nothing to compare")
     if contrasts is None:
         first = next(iter(runs))
         contrasts = [
-            ContrastEntry(name, first, title=f"{name} against {first}")
+            model.ContrastEntry(name, first, title=f"{name} against {first}")
             for name in runs
             if name != first
         ]
     marks = _marks(given)
     compared = tuple(_compared_run(entry, marks[entry.name], runs[entry.name]) for entry in given)
     figures = {run.name: run for run in compared}
-    return Comparison(
+    return model.Comparison(
         kind=kind,
         title=title,
         facts=dict(facts or {}),
@@ -89,7 +80,7 @@ def compare(
     )
 
 
-def load_runs(folder: Path, entries: Iterable[RunEntry]) -> dict[str, LoadedRun]:
+def load_runs(folder: Path, entries: Iterable[model.RunEntry]) -> dict[str, LoadedRun]:
     """Read the runs of a comparison that lies in a folder, by name. Raises UsageError."""
     return {entry.name: load(folder / entry.folder) for entry in entries}
 
@@ -111,11 +102,11 @@ def letter(index: int) -> str:
     return ("" if not rest else letter(rest - 1)) + chr(ord("A") + last)
 
 
-def _marks(entries: Sequence[RunEntry]) -> dict[str, str]:
+def _marks(entries: Sequence[model.RunEntry]) -> dict[str, str]:
     """Return what stands for each run: its part in the comparison, or a short name, or a letter."""
     if all(len(entry.label or entry.name) <= SHORT_NAME for entry in entries):
         return {entry.name: entry.label or entry.name for entry in entries}
-    parts = {entry.name: part_of(entry) for entry in entries}
+    parts = {entry.name: model.part_of(entry) for entry in entries}
     if all(entry.role for entry in entries) and max(map(len, parts.values())) <= LONGEST_PART:
         return parts
     counts: dict[str, int] = {}
@@ -126,12 +117,12 @@ def _marks(entries: Sequence[RunEntry]) -> dict[str, str]:
     return marks
 
 
-def _compared_run(entry: RunEntry, mark: str, run: LoadedRun) -> ComparedRun:
+def _compared_run(entry: model.RunEntry, mark: str, run: LoadedRun) -> model.ComparedRun:
     """Work out one run."""
     tests = tests_of(run)
     samples = samples_of(run)
     planned = len(run.info.seeds) if entry.planned is None else entry.planned
-    return ComparedRun(
+    return model.ComparedRun(
         entry=entry,
         mark=mark,
         setup=run.info.setup,
@@ -148,8 +139,10 @@ def _compared_run(entry: RunEntry, mark: str, run: LoadedRun) -> ComparedRun:
 
 
 def _contrast(
-    entry: ContrastEntry, runs: Mapping[str, LoadedRun], figures: Mapping[str, ComparedRun]
-) -> Contrast:
+    entry: model.ContrastEntry,
+    runs: Mapping[str, LoadedRun],
+    figures: Mapping[str, model.ComparedRun],
+) -> model.Contrast:
     """Compare a run with its reference on the episodes that both flew."""
     reference, target = runs[entry.reference], runs[entry.target]
     flown = {episode.seed: _task(episode) for episode in reference.episodes}
@@ -160,7 +153,7 @@ def _contrast(
     except ValueError as error:
         raise UsageError(f"{reference.path} and {target.path}: {error}") from None
     early, late = (figures[name].stages["t2"].mean for name in (entry.reference, entry.target))
-    return Contrast(
+    return model.Contrast(
         entry=entry,
         paired=paired,
         unmatched=len(known) - len(same),
@@ -210,7 +203,9 @@ def _hold(config: Mapping[str, Any]) -> float | None:
     return next((found for table in tables if (found := _hold(table)) is not None), None)
 
 
-def _navigation_start(run: LoadedRun, tests: Sequence[EpisodeRecord]) -> NavigationStart | None:
+def _navigation_start(
+    run: LoadedRun, tests: Sequence[EpisodeRecord]
+) -> model.NavigationStart | None:
     """Return where navigation begins."""
     rows = []
     energies: list[float] = []
@@ -229,7 +224,7 @@ def _navigation_start(run: LoadedRun, tests: Sequence[EpisodeRecord]) -> Navigat
         return None
     time_s, distance_m, *place = (float(mean) for mean in np.mean(rows, axis=0))
     energy_j = float(np.mean(energies)) if len(energies) == len(rows) else None
-    return NavigationStart(len(rows), time_s, distance_m, energy_j, *place)
+    return model.NavigationStart(len(rows), time_s, distance_m, energy_j, *place)
 
 
 def _position_error(run: LoadedRun, tests: Sequence[EpisodeRecord]) -> float | None:

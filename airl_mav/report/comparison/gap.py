@@ -11,6 +11,7 @@ from airl_mav.core.constants import US_PER_MS
 from airl_mav.flight.statistics import Estimate
 from airl_mav.profiles.published import PublishedRun, load_published, published_gap
 from airl_mav.rehearsal.run_folder import LoadedRun
+from airl_mav.report import measures
 from airl_mav.report.comparison.build import compare
 from airl_mav.report.comparison.documents import comparison_document, worst_seeds
 from airl_mav.report.comparison.figures import contrast_pictures, flight_panels, seed_pictures
@@ -32,13 +33,6 @@ from airl_mav.report.comparison.tables import (
 )
 from airl_mav.report.document import Document, Section
 from airl_mav.report.flights_above import flight_pictures
-from airl_mav.report.measures import (
-    ALL_MEASURES,
-    COMPUTER_ENERGY,
-    ENERGY,
-    FLIGHT_TIME,
-    interval_of,
-)
 from airl_mav.report.run_tables import computer_power
 from airl_mav.report.table import NONE, Column, TableView, ms
 
@@ -90,7 +84,7 @@ def _computer(run: ComparedRun) -> str:
 
 def _longer(contrast: Contrast) -> str:
     """Return a gap of the flight time as a comparative, without its `than`."""
-    difference = FLIGHT_TIME.change(contrast.paired).difference
+    difference = measures.FLIGHT_TIME.change(contrast.paired).difference
     if difference.value is None:
         return "(no goal that both reached) longer"
     comparative = "shorter" if difference.value < 0.0 else "longer"
@@ -98,7 +92,7 @@ def _longer(contrast: Contrast) -> str:
 
 
 def _interval(difference: Estimate) -> str:
-    text = interval_of(difference, 1, "+")
+    text = measures.interval_of(difference, 1, "+")
     return f" ({text})" if text else ""
 
 
@@ -115,7 +109,7 @@ WORST_ROLES = ("reference", "target", "mitigated")
 
 COST, HELP = "cost-on-reference", "mitigation-on-target"
 
-PARTS_OF_ENERGY = (ENERGY, COMPUTER_ENERGY)
+PARTS_OF_ENERGY = (measures.ENERGY, measures.COMPUTER_ENERGY)
 """In the terminal there is room for their sum."""
 
 HEADLINED = (WITHOUT, COMPENSATED, WITH, WITH_TRAINED)
@@ -254,7 +248,7 @@ def runs_table(comparison: Comparison, arena: str) -> TableView:
         Column("flights"),
         *(
             Column(f"{each.title}\n[{each.unit}]", page_only=each in PARTS_OF_ENERGY)
-            for each in ALL_MEASURES
+            for each in measures.ALL_MEASURES
         ),
     )
     rows = []
@@ -264,11 +258,11 @@ def runs_table(comparison: Comparison, arena: str) -> TableView:
                 run.mark,
                 ms(run.stages["t2"].mean, 1),
                 f"{run.quality.success_rate.n:,}",
-                *(measure.with_interval(run.quality) for measure in ALL_MEASURES),
+                *(measure.with_interval(run.quality) for measure in measures.ALL_MEASURES),
             )
         )
         if run.published is not None:
-            figures = [published_value(run, measure) for measure in ALL_MEASURES]
+            figures = [published_value(run, measure) for measure in measures.ALL_MEASURES]
             told = (NONE if figure is None else f"{figure:.4g}" for figure in figures)
             rows.append(("  paper", f"{run.published.latency_ms:g}", NONE, *told))
     notes = (
@@ -411,6 +405,6 @@ def _arena_sections(
         )
     sections += [
         Section(view.title, 3, tables=(view,), in_terminal=False)
-        for view in (contrast_table(comparison, each, ALL_MEASURES) for each in contrasts)
+        for view in (contrast_table(comparison, each, measures.ALL_MEASURES) for each in contrasts)
     ]
     return sections

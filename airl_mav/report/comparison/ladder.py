@@ -9,18 +9,11 @@ from typing import Any
 
 from airl_mav.flight.judge import Outcome
 from airl_mav.rehearsal.run_folder import LoadedRun
+from airl_mav.report.comparison import tables
 from airl_mav.report.comparison.build import compare
 from airl_mav.report.comparison.documents import comparison_document, split_seeds, widest_seeds
 from airl_mav.report.comparison.figures import contrast_pictures
 from airl_mav.report.comparison.model import ComparedRun, Comparison, Contrast, RunEntry
-from airl_mav.report.comparison.tables import (
-    contrast_headlines,
-    contrast_table,
-    flights_fact,
-    plain_facts,
-    runs_table,
-    stages_table,
-)
 from airl_mav.report.document import Document, Section
 from airl_mav.report.measures import MEASURES, count_successes
 from airl_mav.report.table import NONE, OUTCOME_LABELS, Column, TableView, ms
@@ -184,9 +177,9 @@ def document_of(comparison: Comparison, runs: Mapping[str, LoadedRun], folder: P
     """Return everything that a ladder says."""
     reference = comparison.runs[0].mark
     contrasts = comparison.contrasts
-    levels = runs_table(comparison.runs, title="Levels", head="level", measures=MEASURES)
+    levels = tables.runs_table(comparison.runs, title="Levels", head="level", measures=MEASURES)
     latency, start, split = (
-        stages_table(comparison.runs),
+        tables.stages_table(comparison.runs),
         start_table(comparison),
         split_table(comparison),
     )
@@ -195,11 +188,11 @@ def document_of(comparison: Comparison, runs: Mapping[str, LoadedRun], folder: P
         *(
             Section(
                 view.title,
-                headlines=contrast_headlines(contrast),
+                headlines=tables.contrast_headlines(contrast),
                 tables=(view,),
             )
             for contrast in contrasts
-            for view in (contrast_table(comparison, contrast),)
+            for view in (tables.contrast_table(comparison, contrast),)
         ),
         Section(
             "Paired differences",
@@ -224,5 +217,5 @@ def document_of(comparison: Comparison, runs: Mapping[str, LoadedRun], folder: P
         lead=f"The same policy and seeds at {', '.join(run.mark for run in comparison.runs)}; "
         f"differences are from {reference}.",
         sections=sections,
-        facts=(*plain_facts(comparison), *flights_fact(comparison), *hashes),
+        facts=(*tables.plain_facts(comparison), *tables.flights_fact(comparison), *hashes),
     )

@@ -8,23 +8,10 @@ from typing import Any
 
 from airl_mav.core.errors import UsageError
 from airl_mav.rehearsal.run_folder import LoadedRun, load
+from airl_mav.report.comparison import figures, tables
 from airl_mav.report.comparison.build import compare
 from airl_mav.report.comparison.documents import comparison_document
-from airl_mav.report.comparison.figures import (
-    contrast_pictures,
-    energy_picture,
-    flight_panels,
-    latency_pictures,
-)
 from airl_mav.report.comparison.model import Comparison, RunEntry, kind_of, load_entries
-from airl_mav.report.comparison.tables import (
-    conduct_table,
-    contrast_table,
-    facts_table,
-    pair_sentences,
-    runs_table,
-    stages_table,
-)
 from airl_mav.report.document import Document, Section
 from airl_mav.report.flights_above import flight_pictures
 
@@ -79,33 +66,35 @@ def document_of(comparison: Comparison, runs: Mapping[str, LoadedRun], folder: P
     """Return everything that a comparison of runs says."""
     paired = [contrast for contrast in comparison.contrasts if contrast.pairs]
     reference = comparison.runs[0].mark
-    facts = facts_table(comparison)
+    facts = tables.facts_table(comparison)
     sections = [
         Section(facts.title, tables=(facts,))
         if comparison.different
         else Section(facts.title, sentences=("Nothing in what was flown on what.",)),
         Section(
             "Quality of flight",
-            tables=(runs_table(comparison.runs), *conduct_table(comparison.runs)),
+            tables=(tables.runs_table(comparison.runs), *tables.conduct_table(comparison.runs)),
         ),
         Section(
             "Paired differences",
-            sentences=pair_sentences(comparison),
-            tables=tuple(contrast_table(comparison, contrast) for contrast in paired),
-            draw=lambda: contrast_pictures("compare", comparison, paired) if paired else [],
+            sentences=tables.pair_sentences(comparison),
+            tables=tuple(tables.contrast_table(comparison, contrast) for contrast in paired),
+            draw=lambda: figures.contrast_pictures("compare", comparison, paired) if paired else [],
             sheet="compare-differences.png",
             note="Dots: differences on the same seeds. Bars: 95 % intervals. The line of zero: "
             f"{reference}.",
         ),
         Section(
             "Decision latency",
-            tables=(stages_table(comparison.runs),),
-            draw=lambda: latency_pictures(comparison, runs),
+            tables=(tables.stages_table(comparison.runs),),
+            draw=lambda: figures.latency_pictures(comparison, runs),
             sheet="compare-latency.png",
         ),
         Section(
             "Flights from above",
-            draw=lambda: flight_pictures("compare-flights", flight_panels(comparison.runs, runs)),
+            draw=lambda: flight_pictures(
+                "compare-flights", figures.flight_panels(comparison.runs, runs)
+            ),
             sheet="compare-trajectories.png",
             note="All on the same axes. Triangle: start; stars: goals; crosses and squares: where "
             "flights failed.",
@@ -113,7 +102,7 @@ def document_of(comparison: Comparison, runs: Mapping[str, LoadedRun], folder: P
         ),
         Section(
             "Energy of airframe and computer",
-            draw=lambda: [energy_picture(comparison)],
+            draw=lambda: [figures.energy_picture(comparison)],
             in_terminal=False,
         ),
     ]

@@ -13,18 +13,8 @@ from airl_mav.core.errors import UsageError
 from airl_mav.flight.requirements import Requirement, find, settle
 from airl_mav.flight.statistics import reached_goals
 from airl_mav.rehearsal.run_folder import LoadedRun
-from airl_mav.report.comparison import degradation, gap, ladder, matrix, runs
+from airl_mav.report.comparison import degradation, gap, ladder, matrix, model, runs
 from airl_mav.report.comparison.build import load_runs
-from airl_mav.report.comparison.model import (
-    KIND_NAMES,
-    ComparedRun,
-    Comparison,
-    Kind,
-    RunEntry,
-    kind_of,
-    load_entries,
-    save_comparison,
-)
 from airl_mav.report.document import Document, print_document, write_document
 from airl_mav.report.verdict import (
     OverallVerdict,
@@ -43,7 +33,9 @@ FLOWN_UNTIL = "flown_until"
 """Fact of a comparison whose flights were added until the success rate was decided: the rate is
 judged by the test that they were stopped by."""
 
-_BUILD: dict[Kind, Callable[[Mapping[str, Any], Sequence[RunEntry], Runs], Comparison]] = {
+_BUILD: dict[
+    model.Kind, Callable[[Mapping[str, Any], Sequence[model.RunEntry], Runs], model.Comparison]
+] = {
     "compare": runs.build_runs,
     "gap": gap.build_gap,
     "ladder": ladder.build_ladder,
@@ -51,7 +43,7 @@ _BUILD: dict[Kind, Callable[[Mapping[str, Any], Sequence[RunEntry], Runs], Compa
     "degradation": degradation.build_degradation,
 }
 
-_DOCUMENT: dict[Kind, Callable[[Comparison, Runs, Path], Document]] = {
+_DOCUMENT: dict[model.Kind, Callable[[model.Comparison, Runs, Path], Document]] = {
     "compare": runs.document_of,
     "gap": gap.document_of,
     "ladder": ladder.document_of,
@@ -61,8 +53,8 @@ _DOCUMENT: dict[Kind, Callable[[Comparison, Runs, Path], Document]] = {
 
 
 def build_comparison(
-    folder: Path, kind: Kind, facts: Mapping[str, Any], entries: Sequence[RunEntry]
-) -> tuple[Comparison, dict[str, LoadedRun]]:
+    folder: Path, kind: model.Kind, facts: Mapping[str, Any], entries: Sequence[model.RunEntry]
+) -> tuple[model.Comparison, dict[str, LoadedRun]]:
     """Read runs and compare them as a kind of comparison does.
 
     Args:
@@ -78,17 +70,17 @@ def build_comparison(
     return _BUILD[kind](facts, entries, loaded), loaded
 
 
-def rebuild_comparison(folder: Path) -> tuple[Comparison, dict[str, LoadedRun]]:
+def rebuild_comparison(folder: Path) -> tuple[model.Comparison, dict[str, LoadedRun]]:
     """Work the comparison of a folder out again from its runs. Raises UsageError."""
-    kind = kind_of(folder)
+    kind = model.kind_of(folder)
     if kind is None:
-        accepted = ", ".join(KIND_NAMES.values())
+        accepted = ", ".join(model.KIND_NAMES.values())
         raise UsageError(f"{folder}: no comparison here; accepted: the folder of a {accepted}")
-    return build_comparison(folder, kind, *load_entries(folder, kind))
+    return build_comparison(folder, kind, *model.load_entries(folder, kind))
 
 
 def judge_comparison(
-    comparison: Comparison, loaded: Runs, requirements: Sequence[Requirement] = ()
+    comparison: model.Comparison, loaded: Runs, requirements: Sequence[Requirement] = ()
 ) -> OverallVerdict:
     """Return the verdict of a comparison; FieldError if a gap is required without any reference.
 
@@ -125,7 +117,7 @@ def judge_comparison(
     return replace(verdict, sentences=sentences, invalid=lines)
 
 
-def _judged(comparison: Comparison) -> tuple[ComparedRun, ...]:
+def _judged(comparison: model.Comparison) -> tuple[model.ComparedRun, ...]:
     """Return the runs that have to meet what is required."""
     if comparison.kind != "gap":
         return comparison.runs
@@ -138,7 +130,7 @@ def _judged(comparison: Comparison) -> tuple[ComparedRun, ...]:
 
 
 def write_comparison(
-    comparison: Comparison,
+    comparison: model.Comparison,
     loaded: Runs,
     folder: Path,
     verdict: OverallVerdict | None = None,
@@ -156,7 +148,7 @@ def write_comparison(
     """
     verdict = verdict or judge_comparison(comparison, loaded, requirements_of(folder))
     try:
-        save_comparison(comparison, folder)
+        model.save_comparison(comparison, folder)
         save_verdict(verdict, folder)
     except OSError as error:
         raise UsageError(f"{folder}: {error.strerror}") from None
@@ -164,21 +156,25 @@ def write_comparison(
 
 
 def comparison_to_document(
-    comparison: Comparison, loaded: Runs, folder: Path, verdict: OverallVerdict
+    comparison: model.Comparison, loaded: Runs, folder: Path, verdict: OverallVerdict
 ) -> Document:
     """Return everything that a comparison says; nothing is drawn yet."""
     document = _DOCUMENT[comparison.kind](comparison, loaded, folder)
     return replace(document, answers=verdict.lines, status=verdict.status)
 
 
-def print_comparison(comparison: Comparison, loaded: Runs, console: Console, page: Path) -> None:
+def print_comparison(
+    comparison: model.Comparison, loaded: Runs, console: Console, page: Path
+) -> None:
     """Print the verdict, the tables and where the page lies."""
     folder = page.parent
     document = comparison_to_document(comparison, loaded, folder, load_verdict(folder))
     print_document(document, console, page)
 
 
-def show_comparison(comparison: Comparison, loaded: Runs, folder: Path, console: Console) -> Path:
+def show_comparison(
+    comparison: model.Comparison, loaded: Runs, folder: Path, console: Console
+) -> Path:
     """Write a comparison's files and print it; return the path of the page."""
     page = write_comparison(comparison, loaded, folder)
     print_comparison(comparison, loaded, console, page)

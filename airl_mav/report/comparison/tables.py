@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from airl_mav.latency.stages import SETPOINT_TO_MOTOR, SHOWN_STAGES
+from airl_mav.report import table
 from airl_mav.report.comparison.model import ComparedRun, Comparison, Contrast
 from airl_mav.report.conduct import CONDUCT_NOTE
 from airl_mav.report.document import Facts, Headline, estimate_headline
@@ -18,15 +19,6 @@ from airl_mav.report.measures import (
     count_successes,
     interval_of,
     with_interval,
-)
-from airl_mav.report.table import (
-    DURATION_COLUMNS,
-    NONE,
-    TOO_FEW_CELL,
-    TOO_FEW_NOTE,
-    Column,
-    TableView,
-    duration_cells,
 )
 
 SIDE_BY_SIDE = 4
@@ -66,7 +58,7 @@ def published_change(contrast: Contrast, measure: Measure) -> float | None:
 
 def signed(value: float | None, digits: int = 1) -> str:
     """Return a difference with its sign; there is no -0."""
-    return NONE if value is None else f"{round(value, digits) + 0.0:+,.{digits}f}"
+    return table.NONE if value is None else f"{round(value, digits) + 0.0:+,.{digits}f}"
 
 
 def versus(comparison: Comparison, contrast: Contrast) -> str:
@@ -92,12 +84,12 @@ def runs_table(
     title: str = "Quality of flight",
     head: str = "run",
     measures: Sequence[Measure] = (*MEASURES, COMPUTER_ENERGY),
-) -> TableView:
+) -> table.TableView:
     """Return every run by itself, one a row."""
     columns = (
-        Column(head, number=False),
-        Column("flights"),
-        *(Column(measure.title, measure.unit) for measure in measures),
+        table.Column(head, number=False),
+        table.Column("flights"),
+        *(table.Column(measure.title, measure.unit) for measure in measures),
     )
     rows = tuple(
         (
@@ -115,10 +107,10 @@ def runs_table(
         notes.append(_NARROW.format(FEW_FLIGHTS, "flights"))
     if len({run.quality.success_rate.n for run in runs}) > 1:
         notes.append("Not the same number of flights in all runs: compare on the same seeds.")
-    return TableView("quality", title, columns, rows, tuple(notes), in_terminal="stacked")
+    return table.TableView("quality", title, columns, rows, tuple(notes), in_terminal="stacked")
 
 
-def conduct_table(runs: Sequence[ComparedRun]) -> tuple[TableView, ...]:
+def conduct_table(runs: Sequence[ComparedRun]) -> tuple[table.TableView, ...]:
     """Return deadlines and smoothness of every run by itself; empty where none recorded them."""
     if not any(measure.of(run.quality).n for run in runs for measure in CONDUCT):
         return ()
@@ -126,31 +118,34 @@ def conduct_table(runs: Sequence[ComparedRun]) -> tuple[TableView, ...]:
     return (replace(view, key="conduct", notes=(CONDUCT_NOTE,)),)
 
 
-def facts_table(comparison: Comparison) -> TableView:
+def facts_table(comparison: Comparison) -> table.TableView:
     """Return what differs in what was flown, and nothing else; many runs in rows."""
     terms, runs = comparison.different, comparison.runs
     note = f"Only what differs. The reference: {runs[0].heading}."
     if len(runs) > SIDE_BY_SIDE:
-        columns: tuple[Column, ...] = tuple(
-            Column(title, number=False) for title in ("run", "what", "")
+        columns: tuple[table.Column, ...] = tuple(
+            table.Column(title, number=False) for title in ("run", "what", "")
         )
         rows: tuple[tuple[str, ...], ...] = tuple(
-            (run.heading if number == 0 else "", term, run.facts.get(term, NONE))
+            (run.heading if number == 0 else "", term, run.facts.get(term, table.NONE))
             for run in runs
             for number, term in enumerate(terms)
         )
     else:
-        columns = (Column("", number=False), *(Column(r.heading, number=False) for r in runs))
-        rows = tuple((term, *(r.facts.get(term, NONE) for r in runs)) for term in terms)
-    return TableView("facts", "What differs", columns, rows, (note,))
+        columns = (
+            table.Column("", number=False),
+            *(table.Column(r.heading, number=False) for r in runs),
+        )
+        rows = tuple((term, *(r.facts.get(term, table.NONE) for r in runs)) for term in terms)
+    return table.TableView("facts", "What differs", columns, rows, (note,))
 
 
-def stages_table(runs: Sequence[ComparedRun]) -> TableView:
+def stages_table(runs: Sequence[ComparedRun]) -> table.TableView:
     """Return the latencies of all runs, stage by stage."""
     columns = (
-        Column("stage", number=False),
-        Column("run", number=False),
-        *DURATION_COLUMNS,
+        table.Column("stage", number=False),
+        table.Column("run", number=False),
+        *table.DURATION_COLUMNS,
     )
     rows: list[tuple[str, ...]] = []
     mixed = any(run.modelled for run in runs)
@@ -160,7 +155,7 @@ def stages_table(runs: Sequence[ComparedRun]) -> TableView:
         having = [r for r in runs if r.has_stage(stage) or (joint and r.stages[stage.key].n)]
         for number, run in enumerate(having):
             title = stage.title if number == 0 else ""
-            rows.append((title, run.mark, *duration_cells(run.stages[stage.key])))
+            rows.append((title, run.mark, *table.duration_cells(run.stages[stage.key])))
     notes = ["Milliseconds of simulated time."]
     labels = {run.mark: run.setup.injection.label for run in runs}
     if len(set(labels.values())) == 1:
@@ -173,9 +168,9 @@ def stages_table(runs: Sequence[ComparedRun]) -> TableView:
             f"Level gym measures no time: transport and link are constants of its model, t2 is "
             f"drawn ({listed})."
         )
-    if any(TOO_FEW_CELL in row for row in rows):
-        notes.append(TOO_FEW_NOTE)
-    return TableView("latency", "Decision latency", columns, tuple(rows), tuple(notes))
+    if any(table.TOO_FEW_CELL in row for row in rows):
+        notes.append(table.TOO_FEW_NOTE)
+    return table.TableView("latency", "Decision latency", columns, tuple(rows), tuple(notes))
 
 
 # --- contrasts
@@ -183,22 +178,22 @@ def stages_table(runs: Sequence[ComparedRun]) -> TableView:
 
 def contrast_table(
     comparison: Comparison, contrast: Contrast, measures: Sequence[Measure] = MEASURES
-) -> TableView:
+) -> table.TableView:
     """Return one contrast, measure by measure."""
     target, reference = comparison.pair(contrast)
     columns = [
-        Column("same seeds", number=False),
-        Column(reference.mark),
-        Column(target.mark),
-        Column("difference"),
-        Column("95 % interval"),
-        Column("median of pairs", page_only=True),
-        Column("pairs"),
+        table.Column("same seeds", number=False),
+        table.Column(reference.mark),
+        table.Column(target.mark),
+        table.Column("difference"),
+        table.Column("95 % interval"),
+        table.Column("median of pairs", page_only=True),
+        table.Column("pairs"),
     ]
     if contrast.published is not None:
         marks = (reference.mark, target.mark)
-        columns += [Column(f"paper {mark}", page_only=True) for mark in marks]
-        columns.append(Column("paper difference", page_only=True))
+        columns += [table.Column(f"paper {mark}", page_only=True) for mark in marks]
+        columns.append(table.Column("paper difference", page_only=True))
     rows = tuple(_contrast_row(contrast, m, reference, target) for m in measures)
     a = contrast.paired.agreement
     n = contrast.successes
@@ -215,7 +210,7 @@ def contrast_table(
     if contrast.entry.short:
         title += f": {contrast.entry.title}"
     key = f"{contrast.entry.target}-against-{contrast.entry.reference}"
-    return TableView(key, title, tuple(columns), rows, tuple(notes))
+    return table.TableView(key, title, tuple(columns), rows, tuple(notes))
 
 
 def _contrast_row(
@@ -229,9 +224,9 @@ def _contrast_row(
         measure.title,
         measure.plain(change.reference, unit=True),
         measure.plain(change.other, unit=True),
-        NONE if d.value is None else f"{d.value:+.2f} {unit}",
-        interval_of(d, 2, "+") or NONE,
-        NONE if change.median is None else with_interval(change.median, 1, "+"),
+        table.NONE if d.value is None else f"{d.value:+.2f} {unit}",
+        interval_of(d, 2, "+") or table.NONE,
+        table.NONE if change.median is None else with_interval(change.median, 1, "+"),
         f"{d.n:,}",
     )
     if contrast.published is None:
@@ -240,20 +235,20 @@ def _contrast_row(
     told = published_change(contrast, measure)
     return (
         *row,
-        *(NONE if value is None else f"{value:.4g} {measure.unit}" for value in figures),
-        NONE if told is None else f"{told:+.2f} {unit}",
+        *(table.NONE if value is None else f"{value:.4g} {measure.unit}" for value in figures),
+        table.NONE if told is None else f"{told:+.2f} {unit}",
     )
 
 
 def contrasts_table(
     comparison: Comparison, contrasts: Sequence[Contrast], title: str, notes: Sequence[str] = ()
-) -> TableView:
+) -> table.TableView:
     """Return contrasts with their intervals, one a row; published ones below each."""
     columns = (
-        Column("", number=False),
-        *(Column(measure.title, measure.difference_unit) for measure in MEASURES),
-        Column("t2", "%", page_only=True),
-        Column("pairs", page_only=True),
+        table.Column("", number=False),
+        *(table.Column(measure.title, measure.difference_unit) for measure in MEASURES),
+        table.Column("t2", "%", page_only=True),
+        table.Column("pairs", page_only=True),
     )
     rows: list[tuple[str, ...]] = []
     for contrast in contrasts:
@@ -264,7 +259,7 @@ def contrasts_table(
         if contrast.published is not None:
             figures = (signed(published_change(contrast, measure)) for measure in MEASURES)
             t2 = signed(contrast.published.latency_percent, 0)
-            rows.append((f"  {THE_PAPER}", *figures, t2, NONE))
+            rows.append((f"  {THE_PAPER}", *figures, t2, table.NONE))
     notes = [
         *(
             f"{versus(comparison, c)}: {c.entry.title}, {c.successes:,} pairs."
@@ -279,7 +274,7 @@ def contrasts_table(
     ]
     if min((c.successes for c in contrasts), default=FEW_FLIGHTS) < FEW_FLIGHTS:
         notes.append(_NARROW.format(FEW_FLIGHTS, "pairs"))
-    return TableView(
+    return table.TableView(
         "contrasts",
         title,
         columns,

@@ -13,38 +13,15 @@ import math
 from typing import Any
 
 import numpy as np
-from foxglove.messages import (
-    ArrowPrimitive,
-    Color,
-    CubePrimitive,
-    CylinderPrimitive,
-    LinePrimitive,
-    LinePrimitiveLineType,
-    Point3,
-    Pose,
-    Quaternion,
-    SceneEntity,
-    SceneUpdate,
-    SpherePrimitive,
-    TextPrimitive,
-    Timestamp,
-    TriangleListPrimitive,
-    Vector3,
-)
+from foxglove import messages
 from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena, Bounds, PlacedMesh, Shape
 from airl_mav.arena.triangles import drawn, standing
 from airl_mav.black_box.channels import Channel
+from airl_mav.core import frames
 from airl_mav.core.clock import NS_PER_US
 from airl_mav.core.constants import US_PER_S
-from airl_mav.core.frames import (
-    frd_to_flu,
-    ned_to_enu,
-    quat_from_direction,
-    quat_from_euler,
-    quat_ned_frd_to_enu_flu,
-)
 from airl_mav.core.goals import Goal, goal_height_m
 from airl_mav.profiles.vehicle import CORNERS
 from airl_mav.view.look import (
@@ -94,48 +71,48 @@ def channel(topic: str, message: Any) -> Channel:
     return _CHANNELS[key]
 
 
-def timestamp(unix_us: int) -> Timestamp:
+def timestamp(unix_us: int) -> messages.Timestamp:
     """Return a calendar time [µs since 1970]."""
     seconds, rest_us = divmod(unix_us, US_PER_S)
-    return Timestamp(seconds, rest_us * NS_PER_US)
+    return messages.Timestamp(seconds, rest_us * NS_PER_US)
 
 
-def vector(v: Floats) -> Vector3:
+def vector(v: Floats) -> messages.Vector3:
     """Return a vector (3,) of any frame."""
     x, y, z = v.tolist()
-    return Vector3(x=x, y=y, z=z)
+    return messages.Vector3(x=x, y=y, z=z)
 
 
-def quaternion(q: Floats) -> Quaternion:
+def quaternion(q: Floats) -> messages.Quaternion:
     """Return a rotation (4,) [w, x, y, z] of any frames."""
     w, x, y, z = q.tolist()
-    return Quaternion(x=x, y=y, z=z, w=w)
+    return messages.Quaternion(x=x, y=y, z=z, w=w)
 
 
-def place(ned: Floats) -> Vector3:
+def place(ned: Floats) -> messages.Vector3:
     """Return a place (3,) NED [m] in `world`."""
-    return vector(ned_to_enu(np.asarray(ned, np.float64)))
+    return vector(frames.ned_to_enu(np.asarray(ned, np.float64)))
 
 
-def attitude(ned_from_frd: Floats) -> Quaternion:
+def attitude(ned_from_frd: Floats) -> messages.Quaternion:
     """Return an attitude (4,) FRD -> NED as FLU -> `world`."""
-    return quaternion(quat_ned_frd_to_enu_flu(ned_from_frd))
+    return quaternion(frames.quat_ned_frd_to_enu_flu(ned_from_frd))
 
 
-def pose(ned: Floats, ned_from_frd: Floats = UNTURNED) -> Pose:
+def pose(ned: Floats, ned_from_frd: Floats = UNTURNED) -> messages.Pose:
     """Return a pose NED [m], FRD -> NED, in `world`."""
-    return Pose(position=place(ned), orientation=attitude(ned_from_frd))
+    return messages.Pose(position=place(ned), orientation=attitude(ned_from_frd))
 
 
-def points(ned: Floats) -> list[Point3]:
+def points(ned: Floats) -> list[messages.Point3]:
     """Return places (n, 3) NED [m] in `world`."""
-    return [Point3(x=x, y=y, z=z) for x, y, z in ned_to_enu(ned).tolist()]
+    return [messages.Point3(x=x, y=y, z=z) for x, y, z in frames.ned_to_enu(ned).tolist()]
 
 
-def colour(rgb: Colour, opacity: float = 1.0) -> Color:
+def colour(rgb: Colour, opacity: float = 1.0) -> messages.Color:
     """Return a colour."""
     red, green, blue = (part / 255.0 for part in rgb)
-    return Color(r=red, g=green, b=blue, a=opacity)
+    return messages.Color(r=red, g=green, b=blue, a=opacity)
 
 
 THIN_M = 0.02
@@ -145,21 +122,21 @@ Size = tuple[float, float, float]
 
 
 def arena_scene(
-    arena: Arena | None, goal: Goal, goal_radius_m: float, at: Timestamp
-) -> SceneUpdate:
+    arena: Arena | None, goal: Goal, goal_radius_m: float, at: messages.Timestamp
+) -> messages.SceneUpdate:
     """Return what stands still: floor, hills, walls, obstacles, goal and start."""
     bounds = OPEN if arena is None else arena.bounds
     ground = None if arena is None else arena.ground
     base_m = 0.0 if ground is None else ground.height_at(goal[0], goal[1])
     top_m = goal_height_m(goal) or base_m + 0.6 * bounds.height
     entities = [
-        SceneEntity(timestamp=at, frame_id=WORLD, id="floor", cubes=[_floor(bounds)]),
+        messages.SceneEntity(timestamp=at, frame_id=WORLD, id="floor", cubes=[_floor(bounds)]),
         _ends(goal, goal_radius_m, (base_m, top_m), at),
     ]
     if ground is not None:
         entities.append(_surface("ground", ground.points, ground.faces, HILLS, at))
     if arena is not None:
-        walls = SceneEntity(
+        walls = messages.SceneEntity(
             timestamp=at, frame_id=WORLD, id="walls", cubes=_walls(bounds, arena.wall_colour)
         )
         centers = arena.obstacles.center
@@ -170,47 +147,49 @@ def arena_scene(
             if arena.mesh_of(i) not in shown
         ]
         entities += [walls, *still, *(_mesh(each, at) for each in shown)]
-    return SceneUpdate(entities=entities)
+    return messages.SceneUpdate(entities=entities)
 
 
-def movers_scene(arena: Arena, from_us: int, at: Timestamp) -> SceneUpdate:
+def movers_scene(arena: Arena, from_us: int, at: messages.Timestamp) -> messages.SceneUpdate:
     """Return the moving obstacles, so long after the reset [µs]."""
     centers = arena.centers_at(from_us)
     moving = range(arena.n_static, len(arena.obstacles))
-    return SceneUpdate(
+    return messages.SceneUpdate(
         entities=[obstacle(arena, i, centers[i], MOVING, f"mover/{i}", at) for i in moving]
     )
 
 
-def path_scene(way: Floats, at: Timestamp) -> SceneUpdate:
+def path_scene(way: Floats, at: messages.Timestamp) -> messages.SceneUpdate:
     """Return the whole way (n, 3) NED [m] as a line."""
-    line = LinePrimitive(
-        type=LinePrimitiveLineType.LineStrip,
-        pose=Pose(position=vector(np.zeros(3)), orientation=quaternion(UNTURNED)),
+    line = messages.LinePrimitive(
+        type=messages.LinePrimitiveLineType.LineStrip,
+        pose=messages.Pose(position=vector(np.zeros(3)), orientation=quaternion(UNTURNED)),
         thickness=2.0,  # pixels
         scale_invariant=True,
         points=points(way),
         color=colour(FIRST.trail),
     )
-    return SceneUpdate(
-        entities=[SceneEntity(timestamp=at, frame_id=WORLD, id="path", lines=[line])]
+    return messages.SceneUpdate(
+        entities=[messages.SceneEntity(timestamp=at, frame_id=WORLD, id="path", lines=[line])]
     )
 
 
 def velocity_scene(
-    position: Floats, flown: Floats, commanded: Floats | None, at: Timestamp
-) -> SceneUpdate:
+    position: Floats, flown: Floats, commanded: Floats | None, at: messages.Timestamp
+) -> messages.SceneUpdate:
     """Return the velocities (3,) NED [m/s] as arrows from the vehicle's position (3,) NED [m]."""
     arrows = [_arrow(position, flown, FLOWN)]
     if commanded is not None:
         arrows.append(_arrow(position, commanded, COMMANDED))
     shown = [arrow for arrow in arrows if arrow is not None]
-    return SceneUpdate(
-        entities=[SceneEntity(timestamp=at, frame_id=WORLD, id="velocity", arrows=shown)]
+    return messages.SceneUpdate(
+        entities=[messages.SceneEntity(timestamp=at, frame_id=WORLD, id="velocity", arrows=shown)]
     )
 
 
-def vehicle_scene(shape: VehicleShape, frame: str, look: Look, at: Timestamp) -> SceneUpdate:
+def vehicle_scene(
+    shape: VehicleShape, frame: str, look: Look, at: messages.Timestamp
+) -> messages.SceneUpdate:
     """Return a vehicle of its parts, which moves with its frame."""
     forward, right = shape.arm_forward_m, shape.arm_right_m
     height, size = max(0.04, 0.5 * shape.height_m), 0.45 * min(forward, right)
@@ -227,26 +206,28 @@ def vehicle_scene(shape: VehicleShape, frame: str, look: Look, at: Timestamp) ->
         )
         cubes.append(_arm(at_frd, look.body, opacity))
         rotors.append(
-            CylinderPrimitive(
+            messages.CylinderPrimitive(
                 pose=_in_body(at_frd),
-                size=Vector3(x=2.0 * shape.rotor_radius_m, y=2.0 * shape.rotor_radius_m, z=THIN_M),
+                size=messages.Vector3(
+                    x=2.0 * shape.rotor_radius_m, y=2.0 * shape.rotor_radius_m, z=THIN_M
+                ),
                 bottom_scale=1.0,
                 top_scale=1.0,
                 color=colour(look.disc, 0.5 * opacity),
             )
         )
-    entity = SceneEntity(
+    entity = messages.SceneEntity(
         timestamp=at, frame_id=frame, id=frame, frame_locked=True, cubes=cubes, cylinders=rotors
     )
-    return SceneUpdate(entities=[entity])
+    return messages.SceneUpdate(entities=[entity])
 
 
 def obstacle(
-    arena: Arena, i: int, center: Floats, rgb: Colour, name: str, at: Timestamp
-) -> SceneEntity:
+    arena: Arena, i: int, center: Floats, rgb: Colour, name: str, at: messages.Timestamp
+) -> messages.SceneEntity:
     """Return obstacle i, whose centre (3,) NED [m] is there now."""
     half_size = arena.obstacles.half_size[i]
-    yaw = quat_from_euler(0.0, 0.0, float(arena.obstacles.yaw[i]))
+    yaw = frames.quat_from_euler(0.0, 0.0, float(arena.obstacles.yaw[i]))
     glass = arena.clear is not None and bool(arena.clear[i])
     look: dict[str, Any] = {
         "pose": pose(center, yaw),
@@ -255,38 +236,38 @@ def obstacle(
     }
     entity: dict[str, Any] = {"timestamp": at, "frame_id": WORLD, "id": name}
     if arena.obstacles.shape[i] == Shape.BOX:
-        return SceneEntity(**entity, cubes=[CubePrimitive(**look)])
+        return messages.SceneEntity(**entity, cubes=[messages.CubePrimitive(**look)])
     if arena.obstacles.shape[i] == Shape.SPHERE:
-        return SceneEntity(**entity, spheres=[SpherePrimitive(**look)])
-    whole = CylinderPrimitive(**look, bottom_scale=1.0, top_scale=1.0)
-    return SceneEntity(**entity, cylinders=[whole])
+        return messages.SceneEntity(**entity, spheres=[messages.SpherePrimitive(**look)])
+    whole = messages.CylinderPrimitive(**look, bottom_scale=1.0, top_scale=1.0)
+    return messages.SceneEntity(**entity, cylinders=[whole])
 
 
-def _mesh(placed: PlacedMesh, at: Timestamp) -> SceneEntity:
+def _mesh(placed: PlacedMesh, at: messages.Timestamp) -> messages.SceneEntity:
     """Return a mesh where it stands."""
     return _surface(f"mesh/{placed.first}", *standing(placed), STILL, at)
 
 
 def _surface(
-    name: str, places: Floats, faces: NDArray[np.int32], rgb: Colour, at: Timestamp
-) -> SceneEntity:
+    name: str, places: Floats, faces: NDArray[np.int32], rgb: Colour, at: messages.Timestamp
+) -> messages.SceneEntity:
     """Return triangles (m, 3) of places (n, 3) NED [m]."""
-    surface = TriangleListPrimitive(
-        pose=Pose(position=vector(np.zeros(3)), orientation=quaternion(UNTURNED)),
+    surface = messages.TriangleListPrimitive(
+        pose=messages.Pose(position=vector(np.zeros(3)), orientation=quaternion(UNTURNED)),
         points=points(places),
         color=colour(rgb),
         indices=faces.ravel().tolist(),
     )
-    return SceneEntity(timestamp=at, frame_id=WORLD, id=name, triangles=[surface])
+    return messages.SceneEntity(timestamp=at, frame_id=WORLD, id=name, triangles=[surface])
 
 
-def _floor(b: Bounds) -> CubePrimitive:
+def _floor(b: Bounds) -> messages.CubePrimitive:
     north, east = 0.5 * (b.north_min + b.north_max), 0.5 * (b.east_min + b.east_max)
     size = (b.north_max - b.north_min, b.east_max - b.east_min, THIN_M)
     return _block(np.array([north, east, 0.5 * THIN_M]), size, FLOOR)
 
 
-def _walls(b: Bounds, rgb: Colour) -> list[CubePrimitive]:
+def _walls(b: Bounds, rgb: Colour) -> list[messages.CubePrimitive]:
     north, east = 0.5 * (b.north_min + b.north_max), 0.5 * (b.east_min + b.east_max)
     along_east = (THIN_M, b.east_max - b.east_min, b.height)
     along_north = (b.north_max - b.north_min, THIN_M, b.height)
@@ -301,22 +282,26 @@ def _walls(b: Bounds, rgb: Colour) -> list[CubePrimitive]:
     ]
 
 
-def _ends(goal: Goal, radius_m: float, pole_m: tuple[float, float], at: Timestamp) -> SceneEntity:
+def _ends(
+    goal: Goal, radius_m: float, pole_m: tuple[float, float], at: messages.Timestamp
+) -> messages.SceneEntity:
     """Return the goal with its name and its pole, from a height to another, and the start."""
 
-    def disc(place: tuple[float, float, float], radius: float, rgb: Colour) -> CylinderPrimitive:
+    def disc(
+        place: tuple[float, float, float], radius: float, rgb: Colour
+    ) -> messages.CylinderPrimitive:
         return _cylinder(np.array(place) - [0.0, 0.0, THIN_M], radius, THIN_M, rgb, 0.45)
 
     (north, east), (base, top) = goal[:2], pole_m
     pole = _cylinder(np.array([north, east, -0.5 * (base + top)]), 0.04, top - base, GOAL)
-    name = TextPrimitive(
+    name = messages.TextPrimitive(
         pose=pose(np.array([north, east, -top - 0.4])),
         billboard=True,
         font_size=0.6,
         color=colour(GOAL),
         text="goal",
     )
-    return SceneEntity(
+    return messages.SceneEntity(
         timestamp=at,
         frame_id=WORLD,
         id="goal",
@@ -331,56 +316,60 @@ def _ends(goal: Goal, radius_m: float, pole_m: tuple[float, float], at: Timestam
 
 def _cylinder(
     center: Floats, radius: float, height: float, rgb: Colour, opacity: float = 1.0
-) -> CylinderPrimitive:
-    return CylinderPrimitive(
+) -> messages.CylinderPrimitive:
+    return messages.CylinderPrimitive(
         pose=pose(center),
-        size=Vector3(x=2.0 * radius, y=2.0 * radius, z=height),
+        size=messages.Vector3(x=2.0 * radius, y=2.0 * radius, z=height),
         bottom_scale=1.0,
         top_scale=1.0,
         color=colour(rgb, opacity),
     )
 
 
-def _block(center: Floats, size: Size, rgb: Colour, opacity: float = 1.0) -> CubePrimitive:
+def _block(center: Floats, size: Size, rgb: Colour, opacity: float = 1.0) -> messages.CubePrimitive:
     """Return a block, north by east by height [m], at a place NED."""
     x, y, z = size
-    return CubePrimitive(pose=pose(center), size=Vector3(x=x, y=y, z=z), color=colour(rgb, opacity))
-
-
-def _in_body(frd: Floats, yaw: float = 0.0) -> Pose:
-    """Return a place FRD [m] on the body, turned by an angle to the right [rad]."""
-    turned = quat_from_euler(0.0, 0.0, -yaw)
-    return Pose(position=vector(frd_to_flu(frd)), orientation=quaternion(turned))
-
-
-def _part(frd: Size, size: Size, rgb: Colour, opacity: float) -> CubePrimitive:
-    x, y, z = size
-    return CubePrimitive(
-        pose=_in_body(np.array(frd)), size=Vector3(x=x, y=y, z=z), color=colour(rgb, opacity)
+    return messages.CubePrimitive(
+        pose=pose(center), size=messages.Vector3(x=x, y=y, z=z), color=colour(rgb, opacity)
     )
 
 
-def _arm(rotor: Floats, rgb: Colour, opacity: float) -> CubePrimitive:
-    """Return what carries a rotor, from the middle to its place FRD [m]."""
-    forward, right, _ = rotor.tolist()
-    half = np.array([0.5 * forward, 0.5 * right, 0.0])
-    return CubePrimitive(
-        pose=_in_body(half, math.atan2(right, forward)),
-        size=Vector3(x=math.hypot(forward, right), y=0.025, z=0.02),
+def _in_body(frd: Floats, yaw: float = 0.0) -> messages.Pose:
+    """Return a place FRD [m] on the body, turned by an angle to the right [rad]."""
+    turned = frames.quat_from_euler(0.0, 0.0, -yaw)
+    return messages.Pose(position=vector(frames.frd_to_flu(frd)), orientation=quaternion(turned))
+
+
+def _part(frd: Size, size: Size, rgb: Colour, opacity: float) -> messages.CubePrimitive:
+    x, y, z = size
+    return messages.CubePrimitive(
+        pose=_in_body(np.array(frd)),
+        size=messages.Vector3(x=x, y=y, z=z),
         color=colour(rgb, opacity),
     )
 
 
-def _arrow(position: Floats, velocity: Floats, rgb: Colour) -> ArrowPrimitive | None:
+def _arm(rotor: Floats, rgb: Colour, opacity: float) -> messages.CubePrimitive:
+    """Return what carries a rotor, from the middle to its place FRD [m]."""
+    forward, right, _ = rotor.tolist()
+    half = np.array([0.5 * forward, 0.5 * right, 0.0])
+    return messages.CubePrimitive(
+        pose=_in_body(half, math.atan2(right, forward)),
+        size=messages.Vector3(x=math.hypot(forward, right), y=0.025, z=0.02),
+        color=colour(rgb, opacity),
+    )
+
+
+def _arrow(position: Floats, velocity: Floats, rgb: Colour) -> messages.ArrowPrimitive | None:
     """Return the arrow of a velocity NED [m/s]; None: it is too short."""
     length = ARROW_S * float(np.linalg.norm(velocity))
     if length < LEAST_ARROW_M:
         return None
     head = min(0.16, 0.5 * length)
-    return ArrowPrimitive(
-        pose=Pose(
+    return messages.ArrowPrimitive(
+        pose=messages.Pose(
             position=place(position),
-            orientation=quaternion(quat_from_direction(ned_to_enu(velocity))),
+            orientation=quaternion(frames.quat_from_direction(frames.ned_to_enu(velocity))),
         ),
         shaft_length=length - head,
         shaft_diameter=0.05,

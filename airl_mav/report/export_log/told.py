@@ -9,13 +9,7 @@ from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
-from foxglove.messages import (
-    CameraCalibration,
-    FrameTransform,
-    FrameTransforms,
-    RawImage,
-    SceneUpdate,
-)
+from foxglove import messages
 from numpy.typing import NDArray
 
 from airl_mav.black_box.channels import Channel, encoded
@@ -145,7 +139,7 @@ class FlightMessages:
         if self._camera.intrinsics.projection != "cylindrical":
             yield self._drawn(time_us, "/camera/calibration", self._calibration(time_us))
 
-    def _vehicle(self, frame: str, time_us: int) -> SceneUpdate:
+    def _vehicle(self, frame: str, time_us: int) -> messages.SceneUpdate:
         look = FIRST if frame == VEHICLE else OTHER
         return vehicle_scene(self._shape, frame, look, timestamp(self._unix_us(time_us)))
 
@@ -162,7 +156,7 @@ class FlightMessages:
         for i, time_us in enumerate(path.time_us.tolist()):
             at = timestamp(self._unix_us(time_us))
             transforms = [
-                FrameTransform(
+                messages.FrameTransform(
                     timestamp=at,
                     parent_frame_id=WORLD,
                     child_frame_id=frame,
@@ -173,7 +167,7 @@ class FlightMessages:
             if frame == VEHICLE:
                 # With every pose of the vehicle: a viewer that jumps loads the newest message.
                 transforms.append(
-                    FrameTransform(
+                    messages.FrameTransform(
                         timestamp=at,
                         parent_frame_id=VEHICLE,
                         child_frame_id=CAMERA,
@@ -181,7 +175,7 @@ class FlightMessages:
                         rotation=quaternion(quat_flu_from_optical(mount.pitch_up, mount.yaw)),
                     )
                 )
-            yield self._drawn(time_us, topic, FrameTransforms(transforms=transforms))
+            yield self._drawn(time_us, topic, messages.FrameTransforms(transforms=transforms))
 
     def _scene(self, path: Trajectory) -> Iterator[Told]:
         arena, commanded = self._replayed.arena, self._commands(path.time_us)
@@ -197,13 +191,13 @@ class FlightMessages:
 
     # --- the camera
 
-    def _calibration(self, time_us: int) -> CameraCalibration:
+    def _calibration(self, time_us: int) -> messages.CameraCalibration:
         k = self._camera.intrinsics
         f, cx, cy = k.focal, k.cx, k.cy
         # Foxglove's name of the lens that is OpenCV's fisheye; that of a pinhole without
         # distortion is left out.
         bent = k.projection == "fisheye"
-        return CameraCalibration(
+        return messages.CameraCalibration(
             timestamp=timestamp(self._unix_us(time_us)),
             frame_id=CAMERA,
             width=k.width,
@@ -224,7 +218,7 @@ class FlightMessages:
                 continue
             height, width = seen.shape[:2]
             encoding, topic = IMAGES[self._camera.intrinsics.kind]
-            image = RawImage(
+            image = messages.RawImage(
                 timestamp=timestamp(self._unix_us(time_us)),
                 frame_id=CAMERA,
                 width=width,

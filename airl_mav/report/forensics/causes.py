@@ -18,6 +18,7 @@ from airl_mav.flight.quality import measure_leg
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import pose_at
 from airl_mav.latency.stamps import NO_STAMP
+from airl_mav.report.forensics import evidence
 from airl_mav.report.forensics.camera_view import (
     ObstacleView,
     PolicyCamera,
@@ -25,16 +26,6 @@ from airl_mav.report.forensics.camera_view import (
     passes_through,
     view_obstacle,
     view_wall,
-)
-from airl_mav.report.forensics.evidence import (
-    HALF_WIDTH_M,
-    NO_CAUSE,
-    Cause,
-    Evidence,
-    UsualFlight,
-    path_excess,
-    straight_m,
-    time_lost_s,
 )
 from airl_mav.report.forensics.long_flights import cause_of_long_flight
 
@@ -97,7 +88,7 @@ def hit_number(reason: str, arena: Arena | None) -> int | None:
     return number if number < len(arena.obstacles) else None
 
 
-def examine_collision(flight: Evidence) -> Collision | None:
+def examine_collision(flight: evidence.Evidence) -> Collision | None:
     """Take a collision apart; None for a flight that hit nothing, or that has no recording."""
     record, path, stamps, arena = flight.record, flight.path, flight.stamps, flight.arena
     if record.outcome is not Outcome.COLLISION or not len(path):
@@ -160,41 +151,47 @@ answered, nothing of the decision shows in its path."""
 USUAL = "as usual"
 
 
-def cause_of(flight: Evidence, usual: UsualFlight) -> Cause:
+def cause_of(flight: evidence.Evidence, usual: evidence.UsualFlight) -> evidence.Cause:
     """Return the cause of a failure, or of a flight that took longer than is usual."""
     outcome = flight.record.outcome
     if outcome is Outcome.ABORTED:
-        return Cause("aborted", (f"{flight.record.reason}.",))
+        return evidence.Cause("aborted", (f"{flight.record.reason}.",))
     if outcome is Outcome.COLLISION:
         crash = examine_collision(flight)
-        return Cause(NO_CAUSE, ()) if crash is None else _cause_of_collision(flight, crash)
+        return (
+            evidence.Cause(evidence.NO_CAUSE, ())
+            if crash is None
+            else _cause_of_collision(flight, crash)
+        )
     if not len(flight.path):
-        return Cause(NO_CAUSE, ())
+        return evidence.Cause(evidence.NO_CAUSE, ())
     if outcome is Outcome.SUCCESS and not _slow(flight.record, usual):
-        return Cause(USUAL, ())
+        return evidence.Cause(USUAL, ())
     return cause_of_long_flight(flight, usual)
 
 
-def _slow(record: EpisodeRecord, usual: UsualFlight) -> bool:
+def _slow(record: EpisodeRecord, usual: evidence.UsualFlight) -> bool:
     """Return whether a flight took clearly longer, or a longer way, than is usual."""
-    lost, excess = time_lost_s(record, usual), path_excess(record)
+    lost, excess = evidence.time_lost_s(record, usual), evidence.path_excess(record)
     if lost is None or excess is None or usual.pace_s_m is None or usual.path_ratio is None:
         return False
-    slow = lost > SLOW_EXCESS * usual.pace_s_m * straight_m(record)
+    slow = lost > SLOW_EXCESS * usual.pace_s_m * evidence.straight_m(record)
     return slow or excess + 1.0 > (1.0 + SLOW_EXCESS) * usual.path_ratio
 
 
-def _cause_of_collision(flight: Evidence, crash: Collision) -> Cause:
+def _cause_of_collision(flight: evidence.Evidence, crash: Collision) -> evidence.Cause:
     """Return why something was hit."""
     if flight.record.navigation_us is None or flight.record.reason.endswith("take-off"):
-        return Cause("hit during the take-off", (f"At {crash.speed_m_s:.1f} m/s.",))
+        return evidence.Cause("hit during the take-off", (f"At {crash.speed_m_s:.1f} m/s.",))
     if crash.before_s is None or crash.blind_m is None:
-        return Cause("hit before the first decision", ("No decision had reached the motors yet.",))
+        return evidence.Cause(
+            "hit before the first decision", ("No decision had reached the motors yet.",)
+        )
     sentences = [
         f"The last frame that still moved the motors was {crash.before_s:.2f} s old at the "
         f"collision; the vehicle flew {crash.blind_m:.1f} m on it."
     ]
-    kind = NO_CAUSE
+    kind = evidence.NO_CAUSE
     if (view := crash.view) is not None:
         sentences.insert(0, _where(crash, flight.camera))
         half_angle = flight.camera.half_angle_rad if flight.camera else math.pi
@@ -220,7 +217,7 @@ def _cause_of_collision(flight: Evidence, crash: Collision) -> Cause:
             f"Until the motors answered that frame, {crash.lag_s:.2f} s and {crash.lag_m:.1f} m "
             f"went by; speed at the collision {crash.speed_m_s:.1f} m/s."
         )
-    return Cause(kind, tuple(sentences))
+    return evidence.Cause(kind, tuple(sentences))
 
 
 def _seen(crash: Collision, view: ObstacleView, braking_m: Callable[[float], float] | None) -> str:
@@ -229,7 +226,7 @@ def _seen(crash: Collision, view: ObstacleView, braking_m: Callable[[float], flo
         return "seen and flown into"
     if crash.before_s - crash.lag_s < ACT_S:
         return "seen too late to act"
-    room_m = max(0.0, view.distance_m - HALF_WIDTH_M - crash.lag_m)
+    room_m = max(0.0, view.distance_m - evidence.HALF_WIDTH_M - crash.lag_m)
     if braking_m is None or crash.answer_m_s is None:
         return "seen and flown into"
     stops = braking_m(crash.answer_m_s) <= room_m

@@ -17,16 +17,9 @@ from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import LoadedRun
+from airl_mav.report.forensics import evidence
 from airl_mav.report.forensics.camera_view import PolicyCamera
 from airl_mav.report.forensics.causes import cause_of
-from airl_mav.report.forensics.evidence import (
-    Cause,
-    Evidence,
-    path_excess,
-    ranked,
-    time_lost_s,
-    usual_flight,
-)
 from airl_mav.report.table import NONE, OUTCOME_LABELS, Column, TableView
 
 EXAMINED = 100
@@ -48,7 +41,7 @@ class ExaminedFlight:
     """A flight and its cause."""
 
     record: EpisodeRecord
-    cause: Cause
+    cause: evidence.Cause
     lost_s: float | None
     """Against the run's median pace over the same straight way [s]."""
     excess: float | None
@@ -67,13 +60,13 @@ def examine_worst(
     run: LoadedRun, arenas: Mapping[int, Arena], vehicle: VehicleProfile | None
 ) -> list[ExaminedFlight]:
     """Return the worst flights, at most `EXAMINED`, with their causes as far as data allow."""
-    usual = usual_flight(run.episodes)
+    usual = evidence.usual_flight(run.episodes)
     camera = None if vehicle is None else PolicyCamera.of(vehicle.camera)
     brake = None if vehicle is None else partial(_braking_m, vehicle)
     examined = []
-    for record in ranked(run)[:EXAMINED]:
+    for record in evidence.ranked(run)[:EXAMINED]:
         path = flown_path(run, record)
-        flight = Evidence(
+        flight = evidence.Evidence(
             record,
             NOT_RECORDED if path is None else path,
             run.latency.get(record.index, {}),
@@ -81,7 +74,7 @@ def examine_worst(
             camera,
             brake,
         )
-        lost_s, excess = time_lost_s(record, usual), path_excess(record)
+        lost_s, excess = evidence.time_lost_s(record, usual), evidence.path_excess(record)
         examined.append(ExaminedFlight(record, cause_of(flight, usual), lost_s, excess))
     return examined
 

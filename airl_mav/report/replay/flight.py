@@ -16,17 +16,7 @@ from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory, pose_at
 from airl_mav.latency.stamps import SETPOINT, commanded, setpoint_column
 from airl_mav.profiles.vehicle import VehicleProfile
-from airl_mav.view.messages import (
-    ArenaShown,
-    Decided,
-    Episode,
-    Flight,
-    Image,
-    Said,
-    Vehicle,
-    VehicleShape,
-    shape_of,
-)
+from airl_mav.view import messages
 from airl_mav.view.shown import OFFBOARD, STRIP_S, TRAIL_STEP_M, Shown
 
 INFO, WARNING = 6, 4
@@ -71,13 +61,13 @@ class ReplayedFlight:
         return (int(self.path.time_us[-1]) - self.record.started_us) / US_PER_S
 
     @cached_property
-    def episode(self) -> Episode:
+    def episode(self) -> messages.Episode:
         """Its scene."""
-        return Episode(
+        return messages.Episode(
             seed=self.record.seed,
             started_us=self.record.started_us,
-            arena=None if self.arena is None else ArenaShown.of(self.arena),
-            vehicle=VehicleShape.of(self.vehicle),
+            arena=None if self.arena is None else messages.ArenaShown.of(self.arena),
+            vehicle=messages.VehicleShape.of(self.vehicle),
             goal=self.record.goal,
             goal_radius_m=self.record.goal_radius_m,
         )
@@ -117,7 +107,7 @@ class ReplayedFlight:
         number = int(np.searchsorted(self.sent_us, time_us, side="right")) - 1
         return None if number < 0 else number
 
-    def image(self, time_us: int) -> Image | None:
+    def image(self, time_us: int) -> messages.Image | None:
         """Return what the camera saw at a time, without noise; None: no arena."""
         if self.arena is None:
             return None
@@ -144,7 +134,7 @@ class ReplayedFlight:
         x, y, z = position.tolist()
         vx, vy, vz = velocity.tolist()
         q0, q1, q2, q3 = quaternion.tolist()
-        shown.vehicle = Vehicle(
+        shown.vehicle = messages.Vehicle(
             time_us=time_us,
             position=(x, y, z),
             velocity=(vx, vy, vz),
@@ -179,7 +169,7 @@ class ReplayedFlight:
         first, second, third, fourth = (float(part) for part in self.stamps[column][number])
         image = self.image(captured_us)
         shown.decided_image, shown.decisions = image, number + 1
-        shown.decided = Decided(
+        shown.decided = messages.Decided(
             captured_us=captured_us,
             began_us=began_us,
             ready_us=ready_us,
@@ -188,7 +178,7 @@ class ReplayedFlight:
             setpoint=(first, second, third, fourth),
             commands=commanded(self.stamps),
             compensated=self.compensated,
-            shape=(1, 1) if image is None else shape_of(image),
+            shape=(1, 1) if image is None else messages.shape_of(image),
         )
 
     def begin(self, shown: Shown) -> None:
@@ -196,15 +186,17 @@ class ReplayedFlight:
         record = self.record
         shown.take(self.episode, None)
         shown.is_surrounded = True
-        shown.flight = Flight(index=record.index, seed=record.seed, goal=record.goal)
+        shown.flight = messages.Flight(index=record.index, seed=record.seed, goal=record.goal)
         shown.trail = self.trail
         shown.texts.clear()
         for fault in record.faults:
-            shown.texts.append(Said(time_us=fault.from_us, severity=WARNING, text=fault.fault))
+            shown.texts.append(
+                messages.Said(time_us=fault.from_us, severity=WARNING, text=fault.fault)
+            )
         for note in record.notes:
-            shown.texts.append(Said(time_us=None, severity=WARNING, text=note))
+            shown.texts.append(messages.Said(time_us=None, severity=WARNING, text=note))
         how = f"{record.outcome.value}: {record.reason}"
-        shown.texts.append(Said(time_us=record.ended_us, severity=INFO, text=how))
+        shown.texts.append(messages.Said(time_us=record.ended_us, severity=INFO, text=how))
 
     def surround(self, shown: Shown) -> None:
         """Add the arena to `shown`, which began as this flight without it."""

@@ -13,14 +13,7 @@ from typing import NamedTuple, TypeAlias
 from airl_mav.core.constants import DEG, GRAVITY_M_S2, US_PER_S
 from airl_mav.core.frames import Geodetic, Vector
 from airl_mav.vehicle.atmosphere import altitude_m
-from firmware_sim.interfaces import (
-    ActuatorControls,
-    DistanceReading,
-    FlowReading,
-    GpsFix,
-    Odometry,
-    SensorSample,
-)
+from firmware_sim import interfaces
 from firmware_sim.mavlink.codec import Reader, Values, WireMessage, dialect, layout
 from firmware_sim.mavlink.streams.units import triangle
 
@@ -95,7 +88,7 @@ class ControlsError(ValueError):
     """HIL_ACTUATOR_CONTROLS that are invalid for a quadrotor."""
 
 
-def sensor(sample: SensorSample, time_us: int) -> Values:
+def sensor(sample: interfaces.SensorSample, time_us: int) -> Values:
     """Return HIL_SENSOR at the firmware's time [µs]; sensors without a sample are not updated."""
     ax, ay, az = _saturated(sample.accel, ACCEL_LIMIT_M_S2)
     gx, gy, gz = _saturated(sample.gyro, GYRO_LIMIT_RAD_S)
@@ -114,7 +107,7 @@ def sensor(sample: SensorSample, time_us: int) -> Values:
     )
 
 
-def gps(fix: GpsFix, time_us: int) -> Values:
+def gps(fix: interfaces.GpsFix, time_us: int) -> Values:
     """Return HIL_GPS at a time [µs]; PX4 reads `eph`, `epv` as standard deviations [cm]."""
     north, east, down = fix.velocity_ned.tolist()
     speed = math.hypot(north, east)
@@ -136,7 +129,7 @@ def gps(fix: GpsFix, time_us: int) -> Values:
     )
 
 
-def odometry(seen: Odometry, time_us: int) -> Values:
+def odometry(seen: interfaces.Odometry, time_us: int) -> Values:
     """Return ODOMETRY at the firmware's time [µs]; what is not measured is NaN."""
     return (
         time_us,
@@ -154,7 +147,7 @@ def odometry(seen: Odometry, time_us: int) -> Values:
     )
 
 
-def distance(told: DistanceReading, time_us: int) -> Values:
+def distance(told: interfaces.DistanceReading, time_us: int) -> Values:
     """Return DISTANCE_SENSOR at the firmware's time [µs]: whole centimetres, as the message has."""
     quality = 0 if told.quality < 0 else 1 + round(told.quality * 0.99)
     return (
@@ -172,7 +165,7 @@ def distance(told: DistanceReading, time_us: int) -> Values:
     )
 
 
-def flow(told: FlowReading, time_us: int) -> Values:
+def flow(told: interfaces.FlowReading, time_us: int) -> Values:
     """Return HIL_OPTICAL_FLOW at the firmware's time [µs]; it tells no distance."""
     temperature, since_us, distance_m = 0, 0, -1.0
     return (
@@ -207,16 +200,16 @@ def lockstep(message: Controls) -> bool:
     return bool(message.flags & dialect.HIL_ACTUATOR_CONTROLS_FLAGS_LOCKSTEP)
 
 
-def controls(message: Controls, time_us: int) -> ActuatorControls:
+def controls(message: Controls, time_us: int) -> interfaces.ActuatorControls:
     """Return motor commands from `time_us` [µs]; ControlsError outside 0..1 while armed.
 
     Disarmed motors stop: PX4 in HITL sends commands even then.
     """
     if not armed(message):
-        return ActuatorControls(time_us, STILL, armed=False)
+        return interfaces.ActuatorControls(time_us, STILL, armed=False)
     a, b, c, d = message.controls[:MOTORS]
     if 0.0 <= a <= 1.0 and 0.0 <= b <= 1.0 and 0.0 <= c <= 1.0 and 0.0 <= d <= 1.0:
-        return ActuatorControls(time_us, (a, b, c, d), armed=True)
+        return interfaces.ActuatorControls(time_us, (a, b, c, d), armed=True)
     for i, value in enumerate((a, b, c, d)):
         # Written so that NaN fails.
         if not -TOLERANCE <= value <= 1.0 + TOLERANCE:
@@ -225,7 +218,7 @@ def controls(message: Controls, time_us: int) -> ActuatorControls:
                 "airframe a quadrotor?"
             )
     a, b, c, d = (min(1.0, max(0.0, value)) for value in (a, b, c, d))
-    return ActuatorControls(time_us, (a, b, c, d), armed=True)
+    return interfaces.ActuatorControls(time_us, (a, b, c, d), armed=True)
 
 
 def _known(values: Vector | None, width: int) -> tuple[float, ...]:
