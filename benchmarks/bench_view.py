@@ -50,7 +50,6 @@ from airl_mav.profiles.vehicle import load_vehicle  # noqa: E402
 from airl_mav.view.ends import Request, ViewEnds  # noqa: E402
 from airl_mav.view.feed import Feed  # noqa: E402
 from airl_mav.view.messages import (  # noqa: E402
-    ArenaShown,
     Decided,
     Episode,
     Image,
@@ -185,7 +184,7 @@ class Circle:
             Episode(
                 seed=3,
                 started_us=began_us,
-                arena=ArenaShown.of(self.arena),
+                arena=self.arena,
                 vehicle=VehicleShape.of(self.vehicle),
                 goal=(north, east),
                 goal_radius_m=3.0,

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import get_args
+from typing import Annotated, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.core.fields import ArrayField
 from airl_mav.core.streams import Stream, stream
 from airl_mav.profiles.appearance import (
     Appearance,
@@ -72,7 +73,8 @@ class Statics:
     """What the primitives that stand belong to, where some are parts of one asset."""
 
     names: tuple[str, ...]  # (k,) a shape's or an asset's, of each thing that stands
-    of: NDArray[np.int64]  # (n_static,) the thing that each primitive is a part of, ascending
+    of: Annotated[NDArray[np.int64], ArrayField(np.int64)]
+    """(n_static,) the thing that each primitive is a part of, ascending."""
     materials: tuple[str | None, ...]  # (n_static,) None: the one that is drawn for the thing
 
     def name_of(self, i: int) -> str:

@@ -16,6 +16,7 @@ import math
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from functools import cached_property
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +36,7 @@ from airl_mav.arena.appearance import (
 )
 from airl_mav.arena.ground import Ground
 from airl_mav.core.constants import US_PER_S
+from airl_mav.core.fields import ArrayField
 from airl_mav.core.goals import Goal
 from airl_mav.profiles.appearance import DEFAULT, Appearance
 from airl_mav.profiles.mesh_file import MeshFile
@@ -96,6 +98,10 @@ def seen_across(x: float) -> float:
     return 2.0 / (math.pi * square) * (log + turns)
 
 
+Numbers = Annotated[Floats, ArrayField(np.float64)]
+Points = Annotated[Floats, ArrayField(np.float64, 3)]
+
+
 class Shape(IntEnum):
     """Primitive kinds of an obstacle; the numbers are what the numba kernels see."""
 
@@ -128,12 +134,12 @@ class Bounds:
 class Obstacles:
     """n primitives, static ones first."""
 
-    shape: NDArray[np.int8]  # (n,) Shape
-    center: NDArray[np.float64]  # (n, 3) NED [m]; for moving ones: at time 0
-    half_size: NDArray[np.float64]  # (n, 3) [m]
+    shape: Annotated[NDArray[np.int8], ArrayField(np.int8)]  # (n,) Shape
+    center: Points  # (n, 3) NED [m]; for moving ones: at time 0
+    half_size: Points  # (n, 3) [m]
     """Box: half extents along its own axes. Cylinder (vertical axis): radius, radius, half height.
     Sphere: radius three times."""
-    yaw: NDArray[np.float64]  # (n,) heading of a box's first axis [rad]
+    yaw: Numbers  # (n,) heading of a box's first axis [rad]
 
     def __len__(self) -> int:
         """Return n."""
@@ -163,8 +169,10 @@ class PlacedMesh:
 class Tour:
     """The closed way of one moving obstacle: way-points passed at given times, over and over."""
 
-    times_s: NDArray[np.float64]  # (k,) from 0 to the tour's period, increasing
-    points: NDArray[np.float64]  # (k, 2) north, east [m]; the last equals the first
+    times_s: Numbers  # (k,) from 0 to the tour's period, increasing
+    points: Annotated[
+        Floats, ArrayField(np.float64, 2)
+    ]  # (k, 2) north, east [m]; the last equals the first
 
 
 @dataclass(frozen=True)
@@ -190,7 +198,7 @@ class Arena:
     obstacles: Obstacles
     """All obstacles; the last `len(tours)` of them move."""
     tours: tuple[Tour, ...]
-    goal: NDArray[np.float64]  # (2,) north, east [m] from the start
+    goal: Numbers  # (2,) north, east [m] from the start
     appearance: Appearance = DEFAULT
     """What the look is drawn from; geometry knows none of it, and depth nothing but glass."""
     statics: Statics | None = None

@@ -11,10 +11,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from airl_mav.core.fields import ArrayField
 
 Floats = NDArray[np.float64]
 
@@ -44,7 +46,8 @@ def no_relief() -> Relief:
 class Ground:
     """Ground of an arena with hills. Two of them are the same where they are one object."""
 
-    heights: Floats  # (r, c) above the floor, not below 0 [m]; r and c are 2 at least
+    heights: Annotated[Floats, ArrayField(np.float64)]
+    """(r, c) above the floor, not below 0 [m]; r and c are 2 at least."""
     south: float
     """North of the first row [m]."""
     west: float

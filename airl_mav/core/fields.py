@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from types import UnionType
 from typing import Any, TypeVar, Union, get_args, get_origin
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, ValidationError
 from pydantic.fields import FieldInfo
 from pydantic_core import (
@@ -52,6 +53,26 @@ class ProfileModel(BaseModel):
     """Base of all profile models: immutable, unknown fields refused."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class ArrayField:
+    """Annotation of an array in a dataclass that pydantic reads and writes as lists."""
+
+    def __init__(self, dtype: type[Any], columns: int = 0) -> None:
+        """Define an array (n, columns); 0: of any shape."""
+        self._dtype, self._columns = dtype, columns
+
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
+        """Return the schema: numbers in, nested lists out."""
+
+        def read(numbers: Any) -> Any:
+            array = np.asarray(numbers, self._dtype)
+            return array.reshape(-1, self._columns) if self._columns else array
+
+        writes = core_schema.plain_serializer_function_ser_schema(np.ndarray.tolist)
+        return core_schema.no_info_plain_validator_function(read, serialization=writes)
 
 
 def quantity(

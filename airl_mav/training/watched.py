@@ -251,7 +251,7 @@ class Reflight:
             messages.Episode(
                 seed=taped.seed,
                 started_us=began_us,
-                arena=messages.ArenaShown.of(arena),
+                arena=arena,
                 vehicle=messages.VehicleShape.of(navigation.vehicle),
                 goal=goal,
                 goal_radius_m=self._environment.episode.goal_radius_m,

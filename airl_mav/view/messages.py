@@ -14,13 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from airl_mav.arena.appearance import Statics
-from airl_mav.arena.geometry import Arena, Bounds, Building, Obstacles, PlacedMesh, Tour
-from airl_mav.arena.ground import Ground
+from airl_mav.arena.geometry import Arena
 from airl_mav.core.constants import CommandKind
 from airl_mav.core.goals import Goal
-from airl_mav.profiles.appearance import DEFAULT, Appearance
-from airl_mav.profiles.mesh_file import MeshFile
 from airl_mav.profiles.projection import Projection
 from airl_mav.profiles.vehicle import Momentum, VehicleProfile
 
@@ -40,155 +36,6 @@ class Message(BaseModel):
     """One message."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class TourShown(Message):
-    """The way of a moving obstacle, as `arena.geometry.Tour`."""
-
-    times_s: tuple[float, ...]
-    points: tuple[tuple[float, float], ...]
-
-
-class StaticsShown(Message):
-    """What the primitives that stand belong to, as `arena.appearance.Statics`."""
-
-    names: tuple[str, ...]
-    of: tuple[int, ...]
-    materials: tuple[str | None, ...]
-
-
-class MeshShown(Message):
-    """A mesh that cameras see, as `arena.geometry.PlacedMesh`: where its file lies."""
-
-    file: MeshFile
-    place: tuple[float, float]
-    yaw: float
-    scale: float
-    first: int
-    count: int
-    base_m: float = 0.0
-
-    @classmethod
-    def of(cls, placed: PlacedMesh) -> MeshShown:
-        """Return a mesh as plain numbers."""
-        return cls(**{name: getattr(placed, name) for name in cls.model_fields})
-
-    def placed(self) -> PlacedMesh:
-        """Return the mesh."""
-        return PlacedMesh(
-            self.file, self.place, self.yaw, self.scale, self.first, self.count, self.base_m
-        )
-
-
-class GroundShown(Message):
-    """Hills, as `arena.ground.Ground`."""
-
-    heights: tuple[tuple[float, ...], ...]
-    south: float
-    west: float
-    step_north: float
-    step_east: float
-
-    @classmethod
-    def of(cls, ground: Ground | None) -> GroundShown | None:
-        """Return hills as plain numbers; None: there are none."""
-        if ground is None:
-            return None
-        return cls(
-            heights=_rows(ground.heights),
-            south=ground.south,
-            west=ground.west,
-            step_north=ground.step_north,
-            step_east=ground.step_east,
-        )
-
-    def ground(self) -> Ground:
-        """Return the hills."""
-        heights = np.array(self.heights, np.float64)
-        return Ground(heights, self.south, self.west, self.step_north, self.step_east)
-
-
-class ArenaShown(Message):
-    """An arena as plain numbers, as `arena.geometry.Arena`."""
-
-    name: str
-    seed: int
-    bounds: tuple[float, float, float, float, float]
-    wall_colour: tuple[int, int, int]
-    shape: tuple[int, ...]
-    center: tuple[Vector3, ...]
-    half_size: tuple[Vector3, ...]
-    yaw: tuple[float, ...]
-    tours: tuple[TourShown, ...]
-    goal: tuple[float, float]
-    appearance: Appearance = DEFAULT
-    statics: StaticsShown | None = None
-    meshes: tuple[MeshShown, ...] = ()
-    goal_height_m: float | None = None
-    n_gates: int = 0
-    ceiling: bool = False
-    building: Building | None = None
-    ground: GroundShown | None = None
-
-    @classmethod
-    def of(cls, arena: Arena) -> ArenaShown:
-        """Return an arena as plain numbers."""
-        obstacles, (north, east) = arena.obstacles, arena.goal.tolist()
-        statics = None
-        if (known := arena.statics) is not None:
-            statics = StaticsShown(
-                names=known.names, of=tuple(known.of.tolist()), materials=known.materials
-            )
-        return cls(
-            name=arena.name,
-            seed=arena.seed,
-            bounds=_row(arena.bounds.as_array()[:5]),
-            wall_colour=arena.wall_colour,
-            shape=tuple(obstacles.shape.tolist()),
-            center=_rows(obstacles.center),
-            half_size=_rows(obstacles.half_size),
-            yaw=tuple(obstacles.yaw.tolist()),
-            tours=tuple(
-                TourShown(times_s=tuple(tour.times_s.tolist()), points=_rows(tour.points))
-                for tour in arena.tours
-            ),
-            goal=(north, east),
-            appearance=arena.appearance,
-            statics=statics,
-            meshes=tuple(map(MeshShown.of, arena.meshes)),
-            goal_height_m=arena.goal_height_m,
-            n_gates=arena.n_gates,
-            ceiling=arena.bounds.ceiling,
-            building=arena.building,
-            ground=GroundShown.of(arena.ground),
-        )
-
-    def arena(self) -> Arena:
-        """Return the arena."""
-        n, known = len(self.shape), self.statics
-        return Arena(
-            name=self.name,
-            seed=self.seed,
-            bounds=Bounds(*self.bounds, ceiling=self.ceiling),
-            wall_colour=self.wall_colour,
-            obstacles=Obstacles(
-                np.array(self.shape, np.int8),
-                np.array(self.center, np.float64).reshape(n, 3),
-                np.array(self.half_size, np.float64).reshape(n, 3),
-                np.array(self.yaw, np.float64),
-            ),
-            tours=tuple(Tour(np.array(t.times_s), np.array(t.points)) for t in self.tours),
-            goal=np.array(self.goal),
-            appearance=self.appearance,
-            statics=None
-            if known is None
-            else Statics(known.names, np.array(known.of, np.int64), known.materials),
-            meshes=tuple(each.placed() for each in self.meshes),
-            goal_height_m=self.goal_height_m,
-            n_gates=self.n_gates,
-            building=self.building,
-            ground=None if self.ground is None else self.ground.ground(),
-        )
 
 
 class VehicleShape(Message):
@@ -241,7 +88,7 @@ class Episode(Message):
     seed: int
     started_us: int
     """When moving obstacles set out."""
-    arena: ArenaShown | None
+    arena: Arena | None
     """None: an endless floor."""
     vehicle: VehicleShape
     goal: Goal
@@ -396,11 +243,3 @@ def shape_of(image: Image) -> Shape:
 def _number(shape: tuple[int, ...]) -> str:
     """Return the type of an image's numbers."""
     return "<u2" if len(shape) == 2 else "u1"
-
-
-def _row(array: NDArray[np.float64]) -> Any:
-    return tuple(array.tolist())
-
-
-def _rows(array: NDArray[np.float64]) -> Any:
-    return tuple(tuple(row) for row in array.tolist())

@@ -79,7 +79,7 @@ class Shown:
 
     def _begin(self, episode: messages.Episode) -> None:
         self.episode = episode
-        self.arena = None if episode.arena is None else episode.arena.arena()
+        self.arena = episode.arena
         self.episodes += 1
         self.vehicle = self.picture = self.decided = self.decided_image = None
         self.trail, self.decisions = [], 0

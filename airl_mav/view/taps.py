@@ -117,7 +117,7 @@ class SimulationTap:
             messages.Episode(
                 seed=seed,
                 started_us=started_us,
-                arena=messages.ArenaShown.of(arena),
+                arena=arena,
                 vehicle=messages.VehicleShape.of(self._scenario.vehicle),
                 goal=arena.goal_point,
                 goal_radius_m=self._scenario.pilot.goal_radius_m,

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from pydantic import TypeAdapter
 from scipy.integrate import quad
 
 from airl_mav.arena.appearance import FLOOR, OBSTACLE, TEXTURES, WALLS, linear_of, srgb_of
@@ -18,7 +19,6 @@ from airl_mav.core.plugins import GENERATORS
 from airl_mav.profiles.appearance import MATERIALS
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile, profile_digest
-from airl_mav.view.messages import ArenaShown
 
 RICH: dict[str, Any] = {
     "floor": {"materials": ["grass", "checker"]},
@@ -194,5 +194,5 @@ def test_a_generator_of_the_users_gets_the_look_of_its_profile(
 
 def test_the_view_is_told_the_look() -> None:
     arena = make(with_look(shipped("dynamic-obstacles"), **RICH), 3)
-    told = ArenaShown.model_validate_json(ArenaShown.of(arena).model_dump_json()).arena()
+    told = TypeAdapter(Arena).validate_json(TypeAdapter(Arena).dump_json(arena))
     np.testing.assert_array_equal(flat(told.look), flat(arena.look))

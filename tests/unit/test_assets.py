@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pybullet
 import pytest
+from pydantic import TypeAdapter
 from scipy.spatial.transform import Rotation
 
 from airl_mav.arena.appearance import OBSTACLE, TEXTURES, Statics, linear_of
@@ -24,7 +25,6 @@ from airl_mav.envs.contact import NOTHING, WALL, touches
 from airl_mav.profiles.appearance import MATERIALS
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
-from airl_mav.view.messages import ArenaShown
 from firmware_sim.plant.world import World
 
 WIDTH_M = 1.0
@@ -323,7 +323,7 @@ def test_a_name_says_what_was_hit() -> None:
 
 def test_a_view_is_told_what_belongs_together() -> None:
     arena = park(5)
-    shown = ArenaShown.model_validate_json(ArenaShown.of(arena).model_dump_json()).arena()
+    shown = TypeAdapter(Arena).validate_json(TypeAdapter(Arena).dump_json(arena))
     np.testing.assert_array_equal(shown.look.finish.albedo, arena.look.finish.albedo)
     assert shown.statics is not None
     assert arena.statics is not None

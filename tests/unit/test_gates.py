@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 from rich.console import Console
 from scipy import ndimage, stats
 
@@ -30,7 +30,6 @@ from airl_mav.profiles.loading import load_profile
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.piloting import check_goal_height
 from airl_mav.scenario.resolve import resolve
-from airl_mav.view.messages import ArenaShown
 
 WIDTH_M = 0.55
 SEEDS = range(300)
@@ -211,7 +210,7 @@ def test_there_is_a_way_for_the_vehicle_by_a_distance_transform(arenas: list[Are
 
 
 def test_what_a_view_is_told_is_the_arena(arenas: list[Arena]) -> None:
-    shown = ArenaShown.of(arenas[1]).arena()
+    shown = TypeAdapter(Arena).validate_json(TypeAdapter(Arena).dump_json(arenas[1]))
     assert shown.goal_point == arenas[1].goal_point
     np.testing.assert_array_equal(openings_of(shown).center, openings_of(arenas[1]).center)
 

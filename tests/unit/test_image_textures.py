@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from PIL import Image
+from pydantic import TypeAdapter
 
 from airl_mav.arena.appearance import OBSTACLE, TEXTURES, linear_of
 from airl_mav.arena.generate import generate
@@ -25,7 +26,6 @@ from airl_mav.envs.colour_images import Looks
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.image_file import ImageFile
 from airl_mav.profiles.loading import load_profile, profile_digest
-from airl_mav.view.messages import ArenaShown
 
 PROFILE = """
 base = "dense-obstacles"
@@ -160,7 +160,7 @@ def test_a_look_says_which_surfaces_have_it(arena: Arena) -> None:
     assert finish.texture[0] == finish.texture[OBSTACLE] == len(TEXTURES)
     arrays = ColourArrays.of(arena.look)
     np.testing.assert_allclose(arrays.per_m[OBSTACLE:], 0.5)
-    shown = ArenaShown.model_validate_json(ArenaShown.of(arena).model_dump_json()).arena()
+    shown = TypeAdapter(Arena).validate_json(TypeAdapter(Arena).dump_json(arena))
     assert shown.look.finish.images == finish.images
 
 

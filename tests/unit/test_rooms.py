@@ -13,7 +13,7 @@ import pytest
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from pydantic import ValidationError
+from pydantic import TypeAdapter, ValidationError
 from rich.console import Console
 from scipy import ndimage, stats
 
@@ -33,7 +33,6 @@ from airl_mav.envs.contact import CEILING, FLOOR, NOTHING, WALL, clearance, touc
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile, profile_digest
 from airl_mav.report.camera_pictures import ROOM, coloured_segmentation
-from airl_mav.view.messages import ArenaShown
 
 WIDTH_M = 0.55
 SEEDS = range(60)
@@ -462,7 +461,7 @@ def test_profiles_without_them_say_nothing_of_them() -> None:
 
 
 def test_what_a_view_is_told_is_the_arena(arenas: list[Arena]) -> None:
-    shown = ArenaShown.model_validate_json(ArenaShown.of(arenas[1]).model_dump_json()).arena()
+    shown = TypeAdapter(Arena).validate_json(TypeAdapter(Arena).dump_json(arenas[1]))
     assert shown.building == arenas[1].building
     assert shown.bounds == arenas[1].bounds
     np.testing.assert_array_equal(over_doors(shown), over_doors(arenas[1]))

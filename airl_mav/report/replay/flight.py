@@ -66,7 +66,7 @@ class ReplayedFlight:
         return messages.Episode(
             seed=self.record.seed,
             started_us=self.record.started_us,
-            arena=None if self.arena is None else messages.ArenaShown.of(self.arena),
+            arena=self.arena,
             vehicle=messages.VehicleShape.of(self.vehicle),
             goal=self.record.goal,
             goal_radius_m=self.record.goal_radius_m,
