@@ -14,7 +14,7 @@ from airl_mav.core.plugins import NETWORKS, part_name
 from airl_mav.envs.spec import EnvironmentSpec, ExpertName
 from airl_mav.policy.action_sets import SHIPPED, ActionSpec, discrete_actions
 from airl_mav.profiles.computer import load_computer
-from airl_mav.training.table import ALGORITHMS, EARLIER_NAMES, ActionKind, fitting
+from airl_mav.training.table import ALGORITHMS, ActionKind, fitting
 
 SELECTION_SEED = 500_000
 """First seed of the selection episodes; those of training begin at a million, those of evaluation
@@ -145,7 +145,6 @@ class AlgorithmSpec(ProfileModel):
     @field_validator("name")
     @classmethod
     def _is_known(cls, name: str) -> str:
-        name = EARLIER_NAMES.get(name, name)
         if name not in ALGORITHMS:
             raise FieldError("algorithm.name", name, ", ".join(ALGORITHMS))
         return name

@@ -1,4 +1,4 @@
-"""What differs between the algorithms: one row each, and the hyperparameters that each has.
+"""Table of the learning algorithms and their hyperparameters.
 
 `[algorithm]` of a training file has the fields that algorithms share, `[algorithm.options]` those
 of one alone, under the names that stable-baselines3 and sb3-contrib give them. What is left out is
@@ -8,284 +8,145 @@ their default, or `Algorithm.defaults`.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import copy
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from pydantic import Field
+from pydantic import Field, create_model
 
 from airl_mav.core.fields import ProfileModel, quantity
 
 ActionKind = Literal["discrete", "continuous"]
 
-EARLIER_NAMES = {"qrdqn": "qr-dqn"}
-"""Names that training files of earlier versions have."""
-
-_GRADIENT_NORM = "greatest norm of a gradient; greater ones are scaled down"
-_LAMBDA = "lambda of the generalised advantage estimate"
-_ADVANTAGE = "scale the advantages of a batch to mean 0, deviation 1"
+Declared = tuple[Any, Any]
+"""Type and field of an option."""
 
 
-class Options(ProfileModel):
-    """What every algorithm of stable-baselines3 has."""
-
-    stats_window_size: int | None = quantity(
-        "episodes that the logged means are of", "1", ge=1, le=10**6, default=None
-    )
+def _number(kind: Any, meaning: str, **bounds: float) -> Declared:
+    return kind | None, quantity(meaning, "1", default=None, **bounds)
 
 
-class TargetNumbers(ProfileModel):
-    """What a target network has."""
-
-    tau: float | None = quantity(
-        "share of the online network in an update of the target network",
-        "1",
-        gt=0,
-        le=1,
-        default=None,
-    )
+def _choice(kind: Any, meaning: str, **more: Any) -> Declared:
+    return kind | None, Field(default=None, description=meaning, **more)
 
 
-class TargetOptions(Options, TargetNumbers):
-    """Options of the algorithms with a target network."""
+_AUTO_ENTROPY = _choice(
+    float | str,
+    "weight of the entropy: a number, 'auto' (learned) or 'auto_0.1' (from 0.1 on)",
+    pattern=r"^auto(_[0-9.]+)?$",
+)
+_ROLLOUT = "steps of each vehicle a rollout; left out: "
 
-
-class DqnOptions(TargetOptions):
-    """Options of `dqn`."""
-
-    max_grad_norm: float | None = quantity(_GRADIENT_NORM, "1", gt=0, le=1e6, default=None)
-
-
-class DdpgOptions(TargetNumbers):
-    """Options of `ddpg` (Lillicrap et al., arXiv 1509.02971), and of all with SB3's replay."""
-
-    train_freq: int | None = quantity(
-        "steps of each vehicle between two rounds of updates", "1", ge=1, le=10**6, default=None
-    )
-    gradient_steps: int | None = quantity(
-        "updates a round; -1: as many as steps were flown", "1", ge=-1, le=10**6, default=None
-    )
-
-
-class ReplayOptions(TargetOptions, DdpgOptions):
-    """Options of the algorithms with a replay memory of stable-baselines3."""
-
-
-class Td3Options(ReplayOptions):
-    """Options of `td3` (Fujimoto et al., arXiv 1802.09477)."""
-
-    policy_delay: int | None = quantity(
-        "updates of the critics for one of the actor", "1", ge=1, le=1000, default=None
-    )
-    target_policy_noise: float | None = quantity(
-        "standard deviation of the noise on the target's actions",
-        "1",
+_OPTIONS: dict[str, Declared] = {
+    "cg_damping": _number(float, "damping of the Hessian's products", ge=0, le=10),
+    "cg_max_steps": _number(int, "most steps of the conjugate gradient", ge=1, le=1000),
+    "clip_range": _number(float, "greatest change of an action's odds in a rollout", gt=0, le=1),
+    "clip_range_vf": _number(
+        float, "greatest change of a value in a rollout; left out: any", gt=0, le=1e6
+    ),
+    "enable_critic_lstm": _choice(bool, "the value has an LSTM of its own"),
+    "ent_coef": _number(float, "weight of the entropy; left out: 0.005", ge=0, le=10),
+    "expert_share_final": _number(float, "the same in the end; left out: 0", ge=0, le=1),
+    "expert_share_fraction": _number(
+        float, "share of the training in which it falls; left out: 0.3", gt=0, le=1
+    ),
+    "expert_share_initial": _number(
+        float,
+        "share of the decisions that the expert flies at first; left out: 1",
         ge=0,
-        le=10,
-        default=None,
-    )
-    target_noise_clip: float | None = quantity(
-        "greatest such noise", "1", ge=0, le=10, default=None
-    )
-
-
-class QrDqnOptions(ReplayOptions):
-    """Options of `qr-dqn` (Dabney et al., arXiv 1710.10044)."""
-
-    target_update_interval: int | None = quantity(
-        "steps between two updates of the target network", "1", ge=1, le=10**9, default=None
-    )
-    exploration_fraction: float | None = quantity(
-        "share of the training in which exploration falls", "1", gt=0, le=1, default=None
-    )
-    exploration_initial_eps: float | None = quantity(
-        "first share of random actions", "1", ge=0, le=1, default=None
-    )
-    exploration_final_eps: float | None = quantity(
-        "last share of random actions", "1", ge=0, le=1, default=None
-    )
-    max_grad_norm: float | None = quantity(_GRADIENT_NORM, "1", gt=0, le=1e6, default=None)
-    n_quantiles: int | None = quantity("quantiles of a value", "1", ge=1, le=1000, default=None)
-
-
-class NoiseOptions(ProfileModel):
-    """Options of exploration with noise that depends on the state (Raffin et al., gSDE)."""
-
-    use_sde: bool | None = Field(default=None, description="explore with gSDE; continuous actions")
-    sde_sample_freq: int | None = quantity(
-        "steps between two draws of gSDE's noise; -1: once a rollout",
-        "1",
-        ge=-1,
-        le=10**6,
-        default=None,
-    )
-
-
-class A2cOptions(Options, NoiseOptions):
-    """Options of `a2c` (Mnih et al., arXiv 1602.01783)."""
-
-    n_steps: int | None = quantity(
-        "steps of each vehicle a rollout; left out: 5", "1", ge=1, le=10**6, default=None
-    )
-    gae_lambda: float | None = quantity(_LAMBDA, "1", ge=0, le=1, default=None)
-    ent_coef: float | None = quantity("weight of the entropy", "1", ge=0, le=10, default=None)
-    vf_coef: float | None = quantity("weight of the value's loss", "1", ge=0, le=100, default=None)
-    max_grad_norm: float | None = quantity(_GRADIENT_NORM, "1", gt=0, le=1e6, default=None)
-    rms_prop_eps: float | None = quantity(
-        "added to RMSprop's denominator", "1", gt=0, le=1, default=None
-    )
-    use_rms_prop: bool | None = Field(default=None, description="RMSprop, or else Adam")
-    normalize_advantage: bool | None = Field(default=None, description=_ADVANTAGE)
-
-
-class TrpoOptions(Options, NoiseOptions):
-    """Options of `trpo` (Schulman et al., arXiv 1502.05477)."""
-
-    n_steps: int | None = quantity(
-        "steps of each vehicle a rollout; left out: 4096 of all together, in whole batches",
-        "1",
-        ge=1,
-        le=10**6,
-        default=None,
-    )
-    gae_lambda: float | None = quantity(_LAMBDA, "1", ge=0, le=1, default=None)
-    cg_max_steps: int | None = quantity(
-        "most steps of the conjugate gradient", "1", ge=1, le=1000, default=None
-    )
-    cg_damping: float | None = quantity(
-        "damping of the Hessian's products", "1", ge=0, le=10, default=None
-    )
-    line_search_shrinking_factor: float | None = quantity(
-        "by which a step shrinks in the line search", "1", gt=0, lt=1, default=None
-    )
-    line_search_max_iter: int | None = quantity(
-        "most steps of the line search", "1", ge=1, le=1000, default=None
-    )
-    n_critic_updates: int | None = quantity(
-        "updates of the value a rollout", "1", ge=1, le=1000, default=None
-    )
-    normalize_advantage: bool | None = Field(default=None, description=_ADVANTAGE)
-    target_kl: float | None = quantity(
-        "KL divergence that a step may reach", "1", gt=0, le=100, default=None
-    )
-    sub_sampling_factor: int | None = quantity(
-        "so many-th of a rollout are the samples of the step's direction",
-        "1",
-        ge=1,
-        le=1000,
-        default=None,
-    )
-
-
-class SacOptions(ReplayOptions, NoiseOptions):
-    """Options of `sac` (Haarnoja et al., arXiv 1812.05905)."""
-
-    use_sde_at_warmup: bool | None = Field(
-        default=None, description="gSDE in place of uniform actions before learning_starts"
-    )
-
-    ent_coef: float | str | None = Field(
-        default=None,
-        description="weight of the entropy: a number, 'auto' (learned) or 'auto_0.1' (from 0.1 on)",
-        pattern=r"^auto(_[0-9.]+)?$",
-    )
-    target_entropy: float | Literal["auto"] | None = Field(
-        default=None, description="entropy that ent_coef 'auto' aims at; 'auto': -2"
-    )
-    target_update_interval: int | None = quantity(
-        "updates between two of the target network", "1", ge=1, le=10**6, default=None
-    )
-    n_critics: int | None = quantity("critics", "1", ge=1, le=20, default=None)
-
-
-class TqcOptions(SacOptions):
-    """Options of `tqc` (Kuznetsov et al., arXiv 2005.04269)."""
-
-    top_quantiles_to_drop_per_net: int | None = quantity(
-        "highest quantiles of each critic that count for nothing", "1", ge=0, le=999, default=None
-    )
-    n_quantiles: int | None = quantity("quantiles of a critic", "1", ge=1, le=1000, default=None)
-
-
-class PpoOptions(Options, NoiseOptions):
-    """Options of `ppo` (Schulman et al., arXiv 1707.06347)."""
-
-    n_steps: int | None = quantity(
-        "steps of each vehicle a rollout; left out: 4096 of all together, in whole batches",
-        "1",
-        ge=1,
-        le=10**6,
-        default=None,
-    )
-    n_epochs: int | None = quantity(
-        "passes over a rollout; left out: 4", "1", ge=1, le=1000, default=None
-    )
-    gae_lambda: float | None = quantity(_LAMBDA, "1", ge=0, le=1, default=None)
-    clip_range: float | None = quantity(
-        "greatest change of an action's odds in a rollout", "1", gt=0, le=1, default=None
-    )
-    clip_range_vf: float | None = quantity(
-        "greatest change of a value in a rollout; left out: any", "1", gt=0, le=1e6, default=None
-    )
-    normalize_advantage: bool | None = Field(default=None, description=_ADVANTAGE)
-    ent_coef: float | None = quantity(
-        "weight of the entropy; left out: 0.005", "1", ge=0, le=10, default=None
-    )
-    log_std_init: float | None = quantity(
+        le=1,
+    ),
+    "exploration_final_eps": _number(float, "last share of random actions", ge=0, le=1),
+    "exploration_fraction": _number(
+        float, "share of the training in which exploration falls", gt=0, le=1
+    ),
+    "exploration_initial_eps": _number(float, "first share of random actions", ge=0, le=1),
+    "gae_lambda": _number(float, "lambda of the generalised advantage estimate", ge=0, le=1),
+    "gradient_steps": _number(
+        int, "updates a round; -1: as many as steps were flown", ge=-1, le=10**6
+    ),
+    "line_search_max_iter": _number(int, "most steps of the line search", ge=1, le=1000),
+    "line_search_shrinking_factor": _number(
+        float, "by which a step shrinks in the line search", gt=0, lt=1
+    ),
+    "log_std_init": _number(
+        float,
         "logarithm of the first standard deviation of continuous actions, whose range is -1 to 1;"
         " left out: 0",
-        "1",
         ge=-5,
         le=2,
-        default=None,
-    )
-    vf_coef: float | None = quantity("weight of the value's loss", "1", ge=0, le=100, default=None)
-    max_grad_norm: float | None = quantity(_GRADIENT_NORM, "1", gt=0, le=1e6, default=None)
-    target_kl: float | None = quantity(
-        "KL divergence that ends the passes over a rollout; left out: none",
-        "1",
-        gt=0,
-        le=100,
-        default=None,
-    )
+    ),
+    "lstm_hidden_size": _number(int, "units of the LSTM; left out: 128", ge=1, le=2048),
+    "max_grad_norm": _number(
+        float, "greatest norm of a gradient; greater ones are scaled down", gt=0, le=1e6
+    ),
+    "n_critic_updates": _number(int, "updates of the value a rollout", ge=1, le=1000),
+    "n_critics": _number(int, "critics", ge=1, le=20),
+    "n_epochs": _number(int, "passes over a rollout; left out: 4", ge=1, le=1000),
+    "n_lstm_layers": _number(int, "layers of the LSTM", ge=1, le=8),
+    "n_quantiles": _number(int, "quantiles of a value", ge=1, le=1000),
+    "n_steps": _number(int, f"{_ROLLOUT}4096 of all together, in whole batches", ge=1, le=10**6),
+    "normalize_advantage": _choice(bool, "scale the advantages of a batch to mean 0, deviation 1"),
+    "policy_delay": _number(int, "updates of the critics for one of the actor", ge=1, le=1000),
+    "rms_prop_eps": _number(float, "added to RMSprop's denominator", gt=0, le=1),
+    "sde_sample_freq": _number(
+        int, "steps between two draws of gSDE's noise; -1: once a rollout", ge=-1, le=10**6
+    ),
+    "shared_lstm": _choice(
+        bool, "the value takes the actor's LSTM; needs enable_critic_lstm false"
+    ),
+    "stats_window_size": _number(int, "episodes that the logged means are of", ge=1, le=10**6),
+    "sub_sampling_factor": _number(
+        int, "so many-th of a rollout are the samples of the step's direction", ge=1, le=1000
+    ),
+    "target_entropy": _choice(
+        float | Literal["auto"], "entropy that ent_coef 'auto' aims at; 'auto': -2"
+    ),
+    "target_kl": _number(
+        float, "KL divergence that ends the passes over a rollout; left out: none", gt=0, le=100
+    ),
+    "target_noise_clip": _number(float, "greatest such noise", ge=0, le=10),
+    "target_policy_noise": _number(
+        float, "standard deviation of the noise on the target's actions", ge=0, le=10
+    ),
+    "target_update_interval": _number(
+        int, "updates between two of the target network", ge=1, le=10**6
+    ),
+    "tau": _number(
+        float, "share of the online network in an update of the target network", gt=0, le=1
+    ),
+    "top_quantiles_to_drop_per_net": _number(
+        int, "highest quantiles of each critic that count for nothing", ge=0, le=999
+    ),
+    "train_freq": _number(
+        int, "steps of each vehicle between two rounds of updates", ge=1, le=10**6
+    ),
+    "use_rms_prop": _choice(bool, "RMSprop, or else Adam"),
+    "use_sde": _choice(bool, "explore with gSDE; continuous actions"),
+    "use_sde_at_warmup": _choice(bool, "gSDE in place of uniform actions before learning_starts"),
+    "vf_coef": _number(float, "weight of the value's loss", ge=0, le=100),
+}
+"""Options under the names of stable-baselines3 and sb3-contrib; `_options` may replace some."""
 
 
-class RecurrentPpoOptions(PpoOptions):
-    """Options of `recurrent-ppo`: PPO with an LSTM behind the convolutions."""
-
-    lstm_hidden_size: int | None = quantity(
-        "units of the LSTM; left out: 128", "1", ge=1, le=2048, default=None
-    )
-    n_lstm_layers: int | None = quantity("layers of the LSTM", "1", ge=1, le=8, default=None)
-    shared_lstm: bool | None = Field(
-        default=None, description="the value takes the actor's LSTM; needs enable_critic_lstm false"
-    )
-    enable_critic_lstm: bool | None = Field(
-        default=None, description="the value has an LSTM of its own"
-    )
+def _options(names: str, **others: Declared) -> type[ProfileModel]:
+    """Return the model of an algorithm's options."""
+    declared = {name: others.get(name, _OPTIONS[name]) for name in names.split()}
+    fields: dict[str, Any] = {name: (kind, copy(field)) for name, (kind, field) in declared.items()}
+    return create_model("Options", __base__=ProfileModel, **fields)
 
 
-class CloningOptions(Options):
-    """Options of `bc`: behaviour cloning."""
-
-    max_grad_norm: float | None = quantity(_GRADIENT_NORM, "1", gt=0, le=1e6, default=None)
-
-
-class DaggerOptions(CloningOptions):
-    """Options of `dagger` (Ross et al., arXiv 1011.0686)."""
-
-    expert_share_initial: float | None = quantity(
-        "share of the decisions that the expert flies at first; left out: 1",
-        "1",
-        ge=0,
-        le=1,
-        default=None,
-    )
-    expert_share_final: float | None = quantity(
-        "the same in the end; left out: 0", "1", ge=0, le=1, default=None
-    )
-    expert_share_fraction: float | None = quantity(
-        "share of the training in which it falls; left out: 0.3", "1", gt=0, le=1, default=None
-    )
+_SDE = "use_sde sde_sample_freq "
+_UPDATES = "tau train_freq gradient_steps "
+_WINDOW = "stats_window_size "
+_PPO_OPTIONS = (
+    f"{_SDE}{_WINDOW}n_steps n_epochs gae_lambda clip_range clip_range_vf normalize_advantage"
+    " ent_coef log_std_init vf_coef max_grad_norm target_kl"
+)
+_SAC_OPTIONS = (
+    f"{_SDE}{_UPDATES}{_WINDOW}use_sde_at_warmup ent_coef target_entropy target_update_interval"
+    " n_critics"
+)
 
 
 @dataclass(frozen=True)
@@ -296,10 +157,10 @@ class Algorithm:
     """Its class."""
     fields: Mapping[str, str]
     """Fields of `[algorithm]` that it has, and the names of its arguments for them."""
+    options: type[ProfileModel]
+    """Its hyperparameters."""
     actions: ActionKind | None = None
     """The only kind of action set that it can choose from; None: both."""
-    options: type[ProfileModel] = Options
-    """Its hyperparameters."""
     to_policy: tuple[str, ...] = ()
     """Options that the network takes, not the learner."""
     defaults: Mapping[str, Any] = field(default_factory=dict)
@@ -325,6 +186,7 @@ _IMITATED = _same("learning_rate", "batch_size", "buffer_size", "learning_starts
 _PPO: dict[str, Any] = {"n_epochs": 4, "ent_coef": 0.005}
 
 ALGORITHMS: dict[str, Algorithm] = {
+    # Mnih et al., Nature 518 (2015)
     "dqn": Algorithm(
         "airl_mav.training.dqn.DoubleDQN",
         _REPLAY
@@ -334,25 +196,38 @@ ALGORITHMS: dict[str, Algorithm] = {
             "exploration_initial": "exploration_initial_eps",
             "exploration_final": "exploration_final_eps",
         },
+        _options(f"tau {_WINDOW}max_grad_norm"),
         "discrete",
-        DqnOptions,
     ),
+    # Dabney et al., arXiv 1710.10044
     "qr-dqn": Algorithm(
-        "sb3_contrib.QRDQN", _REPLAY, "discrete", QrDqnOptions, to_policy=("n_quantiles",)
+        "sb3_contrib.QRDQN",
+        _REPLAY,
+        _options(
+            f"{_UPDATES}{_WINDOW}target_update_interval exploration_fraction"
+            " exploration_initial_eps exploration_final_eps max_grad_norm n_quantiles",
+            target_update_interval=_number(
+                int, "steps between two updates of the target network", ge=1, le=10**9
+            ),
+        ),
+        "discrete",
+        to_policy=("n_quantiles",),
     ),
+    # Schulman et al., arXiv 1707.06347
     "ppo": Algorithm(
         "stable_baselines3.PPO",
         _BATCHES,
-        options=PpoOptions,
+        _options(_PPO_OPTIONS),
         to_policy=("log_std_init",),
         defaults=_PPO,
         batch=256,
         rollouts=True,
     ),
+    # PPO with an LSTM behind the convolutions
     "recurrent-ppo": Algorithm(
         "sb3_contrib.RecurrentPPO",
         _BATCHES,
-        options=RecurrentPpoOptions,
+        _options(f"{_PPO_OPTIONS} lstm_hidden_size n_lstm_layers shared_lstm enable_critic_lstm"),
         to_policy=(
             "log_std_init",
             "lstm_hidden_size",
@@ -365,28 +240,76 @@ ALGORITHMS: dict[str, Algorithm] = {
         rollouts=True,
         policy="MultiInputLstmPolicy",
     ),
+    # Haarnoja et al., arXiv 1812.05905
     "sac": Algorithm(
-        "stable_baselines3.SAC", _REPLAY, "continuous", SacOptions, to_policy=("n_critics",)
+        "stable_baselines3.SAC",
+        _REPLAY,
+        _options(_SAC_OPTIONS, ent_coef=_AUTO_ENTROPY),
+        "continuous",
+        to_policy=("n_critics",),
     ),
+    # Kuznetsov et al., arXiv 2005.04269
     "tqc": Algorithm(
         "sb3_contrib.TQC",
         _REPLAY,
+        _options(
+            f"{_SAC_OPTIONS} top_quantiles_to_drop_per_net n_quantiles",
+            ent_coef=_AUTO_ENTROPY,
+            n_quantiles=_number(int, "quantiles of a critic", ge=1, le=1000),
+        ),
         "continuous",
-        TqcOptions,
         to_policy=("n_critics", "n_quantiles"),
     ),
+    # Behaviour cloning
     "bc": Algorithm(
         _IMITATION,
         _IMITATED,
-        options=CloningOptions,
+        _options(f"{_WINDOW}max_grad_norm"),
         defaults={"expert_share_final": 1.0},
         batch=256,
     ),
-    "dagger": Algorithm(_IMITATION, _IMITATED, options=DaggerOptions, batch=256),
-    "a2c": Algorithm("stable_baselines3.A2C", _ANY, options=A2cOptions),
-    "ddpg": Algorithm("stable_baselines3.DDPG", _REPLAY, "continuous", DdpgOptions),
-    "td3": Algorithm("stable_baselines3.TD3", _REPLAY, "continuous", Td3Options),
-    "trpo": Algorithm("sb3_contrib.TRPO", _BATCHES, options=TrpoOptions, batch=256, rollouts=True),
+    # Ross et al., arXiv 1011.0686
+    "dagger": Algorithm(
+        _IMITATION,
+        _IMITATED,
+        _options(
+            f"{_WINDOW}max_grad_norm expert_share_initial expert_share_final expert_share_fraction"
+        ),
+        batch=256,
+    ),
+    # Mnih et al., arXiv 1602.01783
+    "a2c": Algorithm(
+        "stable_baselines3.A2C",
+        _ANY,
+        _options(
+            f"{_SDE}{_WINDOW}n_steps gae_lambda ent_coef vf_coef max_grad_norm rms_prop_eps"
+            " use_rms_prop normalize_advantage",
+            n_steps=_number(int, f"{_ROLLOUT}5", ge=1, le=10**6),
+            ent_coef=_number(float, "weight of the entropy", ge=0, le=10),
+        ),
+    ),
+    # Lillicrap et al., arXiv 1509.02971
+    "ddpg": Algorithm("stable_baselines3.DDPG", _REPLAY, _options(_UPDATES), "continuous"),
+    # Fujimoto et al., arXiv 1802.09477
+    "td3": Algorithm(
+        "stable_baselines3.TD3",
+        _REPLAY,
+        _options(f"{_UPDATES}{_WINDOW}policy_delay target_policy_noise target_noise_clip"),
+        "continuous",
+    ),
+    # Schulman et al., arXiv 1502.05477
+    "trpo": Algorithm(
+        "sb3_contrib.TRPO",
+        _BATCHES,
+        _options(
+            f"{_SDE}{_WINDOW}n_steps gae_lambda cg_max_steps cg_damping"
+            " line_search_shrinking_factor line_search_max_iter n_critic_updates"
+            " normalize_advantage target_kl sub_sampling_factor",
+            target_kl=_number(float, "KL divergence that a step may reach", gt=0, le=100),
+        ),
+        batch=256,
+        rollouts=True,
+    ),
 }
 """Algorithms that take Dict observations and need no action mask."""
 

@@ -161,7 +161,7 @@ def test_options_reach_the_learner_and_the_network() -> None:
     )
     assert (tqc.critic.n_quantiles, tqc.critic.n_critics) == (9, 3)
     assert (tqc.top_quantiles_to_drop_per_net, tqc.tau) == (1, 0.1)
-    assert make("qrdqn", options={"n_quantiles": 11}).policy.n_quantiles == 11, "an earlier name"
+    assert make("qr-dqn", options={"n_quantiles": 11}).policy.n_quantiles == 11
     with pytest.raises(UsageError, match=r"algorithm.expert: none for a ToyFleet"):
         make("dagger")
     assert make("recurrent-ppo").policy.lstm_actor.hidden_size == 128
