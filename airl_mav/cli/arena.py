@@ -65,11 +65,6 @@ class ArenaOptions(ProfileModel):
 
 
 OPTIONS = ArenaOptions
-RENAMED_OPTIONS = {
-    "--time": ("--time-s",),
-    "--vehicle-width": ("--vehicle-width-m",),
-    "--goal-radius": ("--goal-radius-m",),
-}
 
 
 def run(options: ArenaOptions, console: Console | None = None) -> int:

@@ -68,7 +68,6 @@ class ConformanceOptions(BaseModel):
 
 
 OPTIONS = ConformanceOptions
-RENAMED_OPTIONS = {"--altitude": ("--altitude-m",), "--connect-timeout": ("--connect-timeout-s",)}
 
 
 def run(options: ConformanceOptions, console: Console | None = None) -> int:

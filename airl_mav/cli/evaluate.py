@@ -11,7 +11,7 @@ from rich.console import Console
 
 from airl_mav.cli.experiments import ExperimentOptions, episodes, fly_and_show
 from airl_mav.cli.gate import Gate, leave, requirements_of
-from airl_mav.cli.options import POSITIONAL, RENAMED, scenario_of
+from airl_mav.cli.options import POSITIONAL, scenario_of
 from airl_mav.cli.telling import Voice
 from airl_mav.cli.viewing import Viewing, view_of
 from airl_mav.core.errors import FieldError
@@ -66,7 +66,6 @@ class EvaluateOptions(Gate, Viewing, ExperimentOptions):
 
 
 OPTIONS = EvaluateOptions
-RENAMED_OPTIONS = RENAMED
 
 
 def run(options: EvaluateOptions, console: Console | None = None) -> int:

@@ -44,15 +44,6 @@ class ExportOptions(ExportRequest):
 
 
 OPTIONS = ExportOptions
-RENAMED_OPTIONS = {
-    "--fov": ("--horizontal-fov-deg",),
-    "--range": ("--range-m",),
-    "--max-speed": ("--max-speed-m-s",),
-    "--hold": ("--hold-s",),
-    "--goal-radius": ("--goal-radius-m",),
-    "--altitude": ("--altitude-m",),
-    "--hover-after": ("--hover-after-s",),
-}
 EXTRAS = ("train",)
 
 CHANGED = ("description", "decisions", *FLOWN)

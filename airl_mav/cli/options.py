@@ -58,39 +58,14 @@ SINGULAR = {"faults": "fault"}
 _FIELD = re.compile(r"\b[a-z0-9]+(?:_[a-z0-9]+)+\b")
 """A word in a message that may be a field's name: one with an underscore, so no word of English."""
 
-RENAMED: dict[str, tuple[str, ...]] = {
-    "--hold": ("--hold-s",),
-    "--altitude": ("--altitude-m",),
-    "--goal-radius": ("--goal-radius-m",),
-    "--time-limit": ("--time-limit-s",),
-    "--hover-after": ("--hover-after-s",),
-}
-"""Old options, and what they are called now."""
 
+def read_options(model: type[Options], prog: str, words: Sequence[str]) -> Options:
+    """Read a command line into its model, whose docstring is the help.
 
-def read_options(
-    model: type[Options],
-    prog: str,
-    words: Sequence[str],
-    *,
-    renamed: Mapping[str, tuple[str, ...]] = RENAMED,
-) -> Options:
-    """Read a command line into its model.
-
-    A first word that ends in .toml is a file of options, as a scenario is one: its values are their
-    defaults.
-
-    Args:
-        model: What the command can be asked for; its docstring is the help.
-        prog: Name of the command.
-        words: The command line without the command's name.
-        renamed: Options that still work under an old name, which is said on standard error.
-
-    Raises:
-        UsageError: A value is out of its range, or the scenario file cannot be used.
-        SystemExit: tyro has printed the help, or what is wrong with the words.
+    A first word that ends in .toml is a file of defaults, such as a scenario. Raises UsageError for
+    unusable values or files, or tyro's SystemExit.
     """
-    words = _with_values(model, _with_new_names(words, renamed))
+    words = _with_values(model, words)
     held: dict[str, Any] = {}
     file = _scenario_file(model, words)
     if file is not None:
@@ -166,22 +141,6 @@ def option_of(field: str) -> str:
         return f"--{SINGULAR[listed]}"
     full = f"{table}.{name}" if table in PREFIXED else CALLED.get(name, name)
     return "--" + full.replace("_", "-")
-
-
-def _with_new_names(words: Sequence[str], renamed: Mapping[str, tuple[str, ...]]) -> list[str]:
-    """Return the words with old options replaced, and say so."""
-    out: list[str] = []
-    for word in words:
-        name, equals, value = word.partition("=")
-        if name not in renamed:
-            out.append(word)
-            continue
-        new = renamed[name]
-        new_console(stderr=True, soft_wrap=True).print(
-            f"{name} is called {' '.join(new)} now", style="yellow", highlight=False
-        )
-        out += [*new[:-1], f"{new[-1]}{equals}{value}"]
-    return out
 
 
 def _with_values(model: type[BaseModel], words: Sequence[str]) -> list[str]:
@@ -274,9 +233,8 @@ def run_command(prog: str, module: str, words: Sequence[str] | None = None) -> N
     """Run the command of a module and exit with its status.
 
     The module has `OPTIONS`, the model of its options; `run(options) -> exit status`, which raises
-    UsageError for input that cannot be used; and where there are any, `RENAMED_OPTIONS` and
-    `EXTRAS`, what it needs beside the simulator. Usage errors become one line and exit status 2, a
-    machine that fails one line and 1.
+    UsageError for input that cannot be used; and optionally `EXTRAS`, what it needs beside the
+    simulator. Usage errors become one line and exit status 2, a machine that fails one line and 1.
     """
     words = sys.argv[1:] if words is None else words
     threading.excepthook = _thread_failed
@@ -312,8 +270,7 @@ def carry_out(prog: str, module: str, words: Sequence[str], **more: Any) -> int:
         # Before the import: it would fail for want of them.
         check_installed("sim")
     command = importlib.import_module(module)
-    renamed = getattr(command, "RENAMED_OPTIONS", RENAMED)
-    options = read_options(command.OPTIONS, prog, words, renamed=renamed)
+    options = read_options(command.OPTIONS, prog, words)
     check_installed(*getattr(command, "EXTRAS", ()))
     try:
         return int(command.run(options, **more))

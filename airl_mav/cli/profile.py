@@ -9,7 +9,7 @@ from typing import Annotated
 from pydantic import Field, field_validator
 from rich.console import Console
 
-from airl_mav.cli.options import POSITIONAL, RENAMED, check_installed
+from airl_mav.cli.options import POSITIONAL, check_installed
 from airl_mav.core.console import new_console
 from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED, FieldError
 from airl_mav.core.progress import RichProgress
@@ -53,7 +53,6 @@ class ProfileOptions(ProfileRequest):
 
 
 OPTIONS = ProfileOptions
-RENAMED_OPTIONS = {**RENAMED, "--price": ("--price-usd",)}
 
 
 def run(options: ProfileOptions, console: Console | None = None) -> int:

@@ -12,7 +12,7 @@ from pydantic import Field
 from rich.console import Console
 
 from airl_mav.cli.gate import Gate, leave, requirements_of
-from airl_mav.cli.options import RENAMED, check_installed, run_command, scenario_of
+from airl_mav.cli.options import check_installed, run_command, scenario_of
 from airl_mav.cli.telling import Telling, Voice
 from airl_mav.cli.video import watcher_of
 from airl_mav.cli.viewing import Viewing, view_of
@@ -58,7 +58,6 @@ class SitlOptions(Gate, Viewing, Telling, Scenario):
 
 
 OPTIONS = SitlOptions
-RENAMED_OPTIONS = {**RENAMED, "--lockstep": ("--level", "lockstep")}
 
 
 def run(options: SitlOptions, console: Console | None = None) -> int:

@@ -42,7 +42,6 @@ class TrainOptions(Telling, TrainRequest, Viewing):
 
 
 OPTIONS = TrainOptions
-RENAMED_OPTIONS = {"--sensing-distance": ("--sensing-distance-m",)}
 EXTRAS = ("sim", "train")
 
 

@@ -226,13 +226,6 @@ def test_what_cannot_be_used(
     assert not list(tmp_path.iterdir())
 
 
-def test_old_names_of_options_still_work(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    words = ["--hold", "0.1", "--price", "80", "--out", str(tmp_path)]
-    options = read_options(command.OPTIONS, "airl profile", words, renamed=command.RENAMED_OPTIONS)
-    assert (options.hold_s, options.price_usd) == (0.1, 80.0)
-    assert "--price is called --price-usd now" in capfd.readouterr().err
-
-
 def test_file_of_another_machine_is_left_alone(tmp_path: Path) -> None:
     path = tmp_path / "box.toml"
     write_profile(path, load_computer("ras-pi-4"))

@@ -629,10 +629,10 @@ def test_cli_prints_the_arena_and_draws_it(tmp_path: Path) -> None:
         ),
         (["no-obstacles", "--png", "/nowhere/a.png"], "--png /nowhere/a.png: cannot write"),
         (
-            ["no-obstacles", "--vehicle-width", "0"],
+            ["no-obstacles", "--vehicle-width-m", "0"],
             "--vehicle-width-m 0: accepted: 0 < value <= 100 m",
         ),
-        (["no-obstacles", "--time=-1"], "--time-s -1: accepted: 0 <= value <= 1e+06 s"),
+        (["no-obstacles", "--time-s=-1"], "--time-s -1: accepted: 0 <= value <= 1e+06 s"),
     ],
 )
 def test_cli_refuses_in_one_line(args: list[str], message: str) -> None:

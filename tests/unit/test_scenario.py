@@ -208,8 +208,7 @@ def test_options_that_contradict_each_other_are_named(
 
 
 def options(*words: str) -> sitl.SitlOptions:
-    renamed = sitl.RENAMED_OPTIONS
-    return read_options(sitl.SitlOptions, "airl-sitl", words, renamed=renamed)
+    return read_options(sitl.SitlOptions, "airl-sitl", words)
 
 
 def read_file(path: Path) -> Scenario:
@@ -353,34 +352,6 @@ def test_the_scenario_of_a_run_flies_it_again(
     assert first.episodes[0].sha256 is not None
     assert first.episodes == again.episodes
     assert first.info.config == again.info.config
-
-
-# --- old names
-
-
-@pytest.mark.parametrize(
-    ("words", "field", "value", "new"),
-    [
-        (["--hold", "0.4"], "hold_s", 0.4, "--hold-s"),
-        (["--hold=0.4"], "hold_s", 0.4, "--hold-s"),
-        (["--altitude", "3"], "altitude_m", 3.0, "--altitude-m"),
-        (["--goal-radius", "1"], "goal_radius_m", 1.0, "--goal-radius-m"),
-        (["--time-limit", "60"], "time_limit_s", 60.0, "--time-limit-s"),
-        (["--lockstep"], "level", "lockstep", "--level lockstep"),
-    ],
-    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
-)
-def test_old_options_work_and_say_their_new_name(
-    words: list[str], field: str, value: object, new: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert getattr(options(*words), field) == value
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert err == f"{words[0].partition('=')[0]} is called {new} now\n"
-
-
-def test_the_old_option_of_hovering_reaches_the_watchdog() -> None:
-    assert options("--hover-after", "0.06").watchdog.hover_after_s == 0.06
 
 
 def test_the_facts_of_a_report_name_the_conditions_that_are_not_the_defaults() -> None:
