@@ -23,7 +23,7 @@ if str(ROOT) not in sys.path:
     sys.path.insert(0, str(ROOT))
 
 from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED, EXIT_USAGE, UsageError  # noqa: E402
-from airl_mav.experiments.behaviour import fly_behaviour, write_behaviour  # noqa: E402
+from published.behaviour import fly_behaviour, write_behaviour  # noqa: E402
 from published.declared import (  # noqa: E402 (from here on the checkout is found)
     Declared,
     read_declared,

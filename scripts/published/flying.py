@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from airl_mav.core.errors import EXIT_INTERRUPTED, EXIT_NOT_MET, EXIT_USAGE, UsageError
-from airl_mav.experiments.behaviour import Difference, differences, fly_behaviour, read_behaviour
+from published.behaviour import Difference, differences, fly_behaviour, read_behaviour
 from published.collect import collect
 from published.declared import Declared
 from published.record import (

@@ -10,9 +10,9 @@ from pydantic import Field, model_validator
 
 from airl_mav.core.fields import ProfileModel, quantity, validated
 from airl_mav.core.files import read_json, write_json
-from airl_mav.experiments.behaviour import read_behaviour
 from airl_mav.flight.statistics import Estimate
 from airl_mav.policy.registry import POLICIES, find_policy, policy_names
+from published.behaviour import read_behaviour
 from published.changes import read_changes, stands
 
 ROOT = Path(__file__).resolve().parents[2]

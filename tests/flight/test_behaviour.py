@@ -8,14 +8,14 @@ import pytest
 
 from airl_mav.core.errors import UsageError
 from airl_mav.experiments import behaviour
-from airl_mav.experiments.behaviour import (
+from airl_mav.profiles.conditions import Payload
+from published.behaviour import (
     Behaviour,
     differences,
     fly_behaviour,
     read_behaviour,
     write_behaviour,
 )
-from airl_mav.profiles.conditions import Payload
 from tests.support.processes import ROOT
 
 STORED = ROOT / "results" / "behaviour.json"

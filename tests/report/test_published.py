@@ -11,7 +11,6 @@ import pytest
 from airl_mav.core.errors import UsageError
 from airl_mav.core.provenance import provenance
 from airl_mav.experiments import roofline as roofline_module
-from airl_mav.experiments.behaviour import read_behaviour
 from airl_mav.experiments.evaluate import evaluate
 from airl_mav.experiments.fly import rehearse
 from airl_mav.flight.statistics import aggregate
@@ -20,6 +19,7 @@ from airl_mav.report.saved_table import write_table
 from airl_mav.report.table import Column, TableView
 from airl_mav.scenario.model import DEFAULT_POLICY, Scenario
 from published import coverage, flying, pages, record, tables_policies
+from published.behaviour import read_behaviour
 from published.changes import Change, read_changes, stands
 from published.collect import collect
 from published.declared import Declared, read_declared

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from airl_mav.conformance.reference import StoredStep
-from airl_mav.conformance.response import fit_response, load_steps
 from airl_mav.conformance.result import ConformanceResult, Settings
 from airl_mav.conformance.steps import (
     MANOEUVRES,
@@ -26,6 +25,7 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import validated
 from airl_mav.profiles.loading import profiles_dir
 from airl_mav.profiles.vehicle import Response, load_vehicle
+from fitted_response import fit_response, load_steps
 from tests.support.processes import ROOT
 
 if sys.version_info >= (3, 11):
