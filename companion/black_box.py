@@ -1,7 +1,7 @@
 """The black box: what the companion saw, decided and sent, in a file that survives a crash.
 
-Telemetry, status and resources are sampled by a thread of the black box's own; the pilot hands its
-decisions over without waiting. Four times a second everything is put onto the disk.
+A thread samples telemetry, status and resources, takes the pilot's decisions without delaying it,
+and syncs the file four times a second.
 """
 
 from __future__ import annotations
@@ -57,11 +57,7 @@ class RecordedLink(Protocol):
 
 
 class BlackBoxRecorder:
-    """Writes a black box while a mission is flown.
-
-    A file that cannot be written any more, on a full or failing disk, ends there, and the flight
-    goes on: `failure` then says why.
-    """
+    """Writes a black box during a mission; a write error (`failure`) ends only the file."""
 
     def __init__(
         self,

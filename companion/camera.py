@@ -50,10 +50,9 @@ class FrameSource(Protocol):
 class ZmqFrameSource:
     """Frames published by a simulator or a camera driver over ZeroMQ (tcp, ipc).
 
-    ZeroMQ keeps only the newest message, also while nobody asks, and reconnects by itself where it
-    sees that the publisher is gone. It does not see one whose computer has lost its power, and ends
-    for good what sends more than a frame can be: after a silence the connection is made anew. To be
-    used from one thread at a time.
+    ZeroMQ keeps the newest message only and reconnects to a closed publisher. It notices neither a
+    publisher without power nor recovers from oversized frames: after silence it is connected anew.
+    For one thread at a time.
     """
 
     def __init__(

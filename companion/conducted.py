@@ -1,7 +1,4 @@
-"""The companion's clock in lockstep: sleeping gives the turn back to the scheduler.
-
-Simulated time stands still while the companion works, and advances only while it sleeps.
-"""
+"""The companion's lockstep clock: simulated time advances only while the companion sleeps."""
 
 from __future__ import annotations
 
@@ -18,17 +15,13 @@ turn, which may come earlier."""
 
 
 class Abandoned(BaseException):
-    """Raised in the companion when the scheduler is gone; the message, if any, says why.
-
-    Not an Exception: code that handles the failures of a flight must not handle this.
-    """
+    """Raised when the scheduler is gone; not an Exception, to pass handlers of failures."""
 
 
 class ConductedClock:
-    """Simulated time of a companion in lockstep. Implements `clock.Clock`.
+    """Simulated time of a companion in lockstep, and the watchdog's guard. Implements `Clock`.
 
-    It is also the watchdog's guard (`guard.Guard`): in lockstep only sleeping takes simulated time,
-    so deadlines can only pass there.
+    Only sleeping takes simulated time, so deadlines can only pass there.
     """
 
     def __init__(self, clock: Clock, sleep: Sleep) -> None:

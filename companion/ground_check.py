@@ -1,7 +1,7 @@
-"""What can be wrong before take-off, looked at on the ground: `airl-companion --check`.
+"""Pre-flight check on the ground: `airl-companion --check`.
 
-Camera, flight controller and policy are looked at as a flight would use them, for a few seconds.
-Nothing is armed, and no setpoint is sent.
+Camera, flight controller and policy run as in flight for a few seconds, without arming or
+setpoints.
 """
 
 from __future__ import annotations

@@ -1,11 +1,8 @@
-"""What the companion believes of its neighbours, and how far it flies on their word.
+"""Plausibility limits of telemetry, camera and mode, and limits of the flight.
 
-A learned policy acts on whatever it is told: with a frozen position it flies past its goal, with
-a frozen image into what it cannot see. Each rule here says when telemetry, camera or mode are no
-longer to be trusted. The first one that is broken ends the flight: see `mission.py`.
-
-The bounds are wide: they tell a lie from noise, not a good sensor from a bad one, which is the
-estimator's task.
+A learned policy acts on any input: with a frozen position it flies past its goal, with a frozen
+image into obstacles. The first broken rule ends the flight: see `mission.py`. The bounds are wide;
+sensor quality is the estimator's task.
 """
 
 from __future__ import annotations

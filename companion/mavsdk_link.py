@@ -1,8 +1,6 @@
-"""The companion's link to the flight controller: MAVSDK, as on the real aircraft.
+"""The companion's link to the flight controller: MAVSDK's synchronous API, without a thread hop.
 
-MAVSDK's synchronous API: a call is a plain C call, while the asyncio one adds a thread hop.
-MAVSDK sends a setpoint at once and then repeats it at 20 Hz from a thread of its own, also when
-this process hangs; `watchdog.py` is there for that.
+MAVSDK repeats setpoints at 20 Hz from its own thread, even when this process hangs: `watchdog.py`.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
-"""OBSTACLE_DISTANCE: how far obstacles are, for the flight controller's collision prevention.
+"""OBSTACLE_DISTANCE for the flight controller's collision prevention.
 
-Made of the newest depth image: what lies about as high as the camera, level, whatever the vehicle's
-tilt. A direction without a return within the camera's range is told as free, those beside the field
-of view as unknown.
+Made of the newest depth image around the camera's height, level at any tilt. Directions without a
+return within range are free, those beside the field of view unknown.
 """
 
 from __future__ import annotations

@@ -1,8 +1,4 @@
-"""Signs what MAVSDK sends, and checks what it gets: MAVSDK itself has no MAVLink 2 signing.
-
-A proxy between two UDP sockets, on a thread of its own. It takes MAVSDK's place on the port where
-the flight controller expects it, and is the flight controller for MAVSDK.
-"""
+"""MAVLink 2 signing, which MAVSDK lacks: a UDP proxy on its own thread, in MAVSDK's place."""
 
 from __future__ import annotations
 

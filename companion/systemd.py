@@ -1,7 +1,4 @@
-"""What systemd is told of a service: ready, what it does, alive (sd_notify(3)).
-
-Nothing is told, and nothing costs, where nobody listens: `$NOTIFY_SOCKET` is not set.
-"""
+"""Notifications for systemd (sd_notify(3)): ready, status, alive; none without `$NOTIFY_SOCKET`."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""TIMESYNC exchanges with the flight controller: the offset of its clock, and the round trip.
-
-MAVSDK's own TIMESYNC keeps its result to itself, so the messages go through `mavlink_direct`.
-"""
+"""TIMESYNC with the flight controller through `mavlink_direct`: clock offset and round trip."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""The video of a camera as a program: opens the camera, sends what it sees, tells who asks.
+"""Video of a camera as a program, announced by MAVLink's camera protocol.
 
-MAVLink's camera protocol (https://mavlink.io/en/services/camera.html): QGroundControl and MAVSDK
-find the component by its heartbeat, ask for CAMERA_INFORMATION, and show the stream that
-VIDEO_STREAM_INFORMATION names. It takes no photos, records nothing and stores nothing, and says so.
+QGroundControl and MAVSDK find the component by its heartbeat, request CAMERA_INFORMATION, and show
+the stream of VIDEO_STREAM_INFORMATION (https://mavlink.io/en/services/camera.html). It reports that
+it takes no photos and records nothing.
 """
 
 from __future__ import annotations

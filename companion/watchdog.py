@@ -1,14 +1,12 @@
-"""What happens when the loop, the camera or the link goes quiet.
+"""Reactions to a silent decision loop, camera or link.
 
-MAVSDK repeats the last setpoint at 20 Hz whatever this process does, so a hung policy would keep
-the vehicle moving for ever and the offboard-loss failsafe would never fire. Three lines of
-defence, each for the case that the one before cannot see:
+MAVSDK repeats the last setpoint at 20 Hz, so a hung policy would keep the vehicle moving and
+prevent the offboard-loss failsafe. Three lines of defence:
 
 1. A decision that is overdue zeroes the velocity.
 2. Still none: offboard is left, the flight controller holds.
-3. Nobody looks any more (a policy that holds Python's interpreter lock): a C-level timer ends the
-   process, the setpoints stop, and the flight controller's offboard-loss failsafe acts; see
-   `guard.py`, which does the looking.
+3. A policy holds Python's interpreter lock: a C-level timer ends the process (`guard.py`), and the
+   offboard-loss failsafe acts.
 """
 
 from __future__ import annotations
@@ -23,10 +21,7 @@ from companion.interfaces import STOP, BodyVelocity, Link, LinkError, Setpoint
 
 
 class Watchdog:
-    """Guards the setpoints of one mission. All commands of the pilot go through `command`.
-
-    It keeps the deadlines; a guard calls `look` when one may have passed.
-    """
+    """Guards a mission's setpoints, sent by `command`; a guard calls `look` at its deadlines."""
 
     def __init__(self, link: Link, clock: Clock, settings: WatchdogSettings) -> None:
         self.notes: list[str] = []

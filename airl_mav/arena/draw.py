@@ -1,8 +1,7 @@
 """An arena from above on a matplotlib Axes: x east, y north, metres from the start.
 
-Layers (zorder): floor, hills and grid below 1, zones and tours 1, obstacles 2, start and goal 3.
-Draw what flew through it at 2.5 or above. Every kind of thing has one labelled artist, for the
-legend.
+Layers (zorder): floor, hills and grid below 1, zones and tours 1, obstacles 2, start and goal 3;
+draw flights at 2.5 or above. The legend has one artist per kind.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Gates: walls across the arena with an opening, that the vehicle has to fly through.
 
-A gate is four boxes around its opening: west and east of it from the floor to the top, below and
-above it between these two. They are primitives as any other: bodies, images and contacts need to
-know nothing of gates.
+A gate is four boxes around its opening: west and east of it up to the top, below and above it
+between these; no other code needs to know gates.
 """
 
 from __future__ import annotations

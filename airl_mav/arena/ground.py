@@ -1,9 +1,7 @@
 """Ground that rises above the floor: heights on a grid, and the triangles between them.
 
-Each cell of the grid is two triangles, split from its south-west to its north-east corner. Cameras,
-contacts, placement and maps all use this surface, and it alone: `Ground.faces` lists its triangles,
-and the kernels of `arena.relief` say how high it is. They are imported late: programs that only
-tell what they can do know arenas, and need no numba.
+Each cell is two triangles, split from south-west to north-east, listed by `Ground.faces` and used
+by everything. The kernels of `arena.relief` are imported late, for programs without numba.
 """
 
 from __future__ import annotations

@@ -1,9 +1,7 @@
 """An asset from a mesh: boxes along its axes that cover its surface.
 
-Contacts and planners know boxes, cylinders and spheres, so a mesh becomes boxes: it is cut into
-cubic cells, those that its surface passes through are taken, a closed one is filled, and
-neighbouring cells are joined. What is covered is no less than the mesh, and at most
-`MeshBoxes.beyond_m` more. Cameras see the mesh itself (`triangles`).
+The mesh is cut into cubic cells; those at its surface and inside a closed one are joined to boxes,
+which exceed it by at most `MeshBoxes.beyond_m`. Cameras see the mesh itself (`triangles`).
 """
 
 from __future__ import annotations

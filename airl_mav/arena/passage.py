@@ -1,8 +1,4 @@
-"""Is there a way, wide enough for the vehicle, from the start to the goal? Never a wrong yes.
-
-Only what stands counts: walls, static obstacles, at their full footprint, and hills that rise above
-a height.
-"""
+"""Conservative search for a way from start to goal around static footprints and hills."""
 
 from __future__ import annotations
 

@@ -1,9 +1,8 @@
 """Rooms: walls inside an arena with doors, so that every room can be reached from every other.
 
-The floor is cut in two, each part again, until there are as many rooms as asked for; or a corridor
-runs along it, with a row of rooms on either side. Doors join rooms along a random spanning tree,
-and some of the other neighbours. Walls are boxes from the floor to the top, and above each door a
-lintel: primitives as any other, so bodies, images and contacts need to know nothing of rooms.
+The floor is halved until there are enough rooms; or a corridor runs along it, with a row of rooms
+on either side. Doors join rooms along a random spanning tree, and some other neighbours. Walls and
+the lintels above doors are boxes, so that no other code needs to know rooms.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
-"""The triangles of a mesh that cameras see, in a file beside the arena's profile.
+"""Triangles of a visible mesh, in a file beside the arena's profile, which has its SHA-256.
 
-A NumPy archive (.npz) without pickled objects holds two arrays: `vertices` (n, 3) float32, forward,
-right and down from the asset's place on the floor [m], and `faces` (m, 3) int32, the corners of the
-triangles. The profile says the file's SHA-256.
+A NumPy archive (.npz) without pickled objects holds `vertices` (n, 3) float32, forward, right and
+down from the asset's place on the floor [m], and `faces` (m, 3) int32, the triangles' corners.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Messages as bytes, and the channel that says what they are: of files and of live streams.
+"""Messages as bytes with their channels, for files and live streams.
 
-Its parser (packages/mcap-support/src/parseJsonSchema.ts in foxglove/studio) wants every property
-with one plain `type`, arrays with one `items`, and bytes as base64; it follows no references and
-knows no alternatives.
+Foxglove's parser (packages/mcap-support/src/parseJsonSchema.ts in foxglove/studio) requires one
+plain `type` per property, one `items` per array and base64 bytes; it supports neither references
+nor alternatives.
 """
 
 from __future__ import annotations

@@ -1,11 +1,9 @@
-"""What a black box holds: its topics, and the message of each.
+"""Topics and messages of a black box.
 
-Messages are JSON with a JSON Schema, made of the classes here, so that any reader of MCAP
-(Foxglove, `mcap cat`, pandas) shows them. Images and texts have the schemas of Foxglove's that
-its panels know (https://docs.foxglove.dev/docs/visualization/message-schemas/introduction).
-
-Times `*_us` are those of the companion's clock, from its start [µs]; world frames are NED with the
-start of the flight as origin, bodies FRD.
+Messages are JSON with a JSON Schema, made of the classes here, for any reader of MCAP (Foxglove,
+`mcap cat`, pandas). Images and texts have Foxglove's schemas
+(https://docs.foxglove.dev/docs/visualization/message-schemas/introduction). Times `*_us` count from
+the companion's start [µs]; world frames are NED from the start of the flight, bodies FRD.
 """
 
 from __future__ import annotations

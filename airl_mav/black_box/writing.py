@@ -67,11 +67,7 @@ class McapFile:
 
 
 class BlackBoxFile(McapFile):
-    """An MCAP file that grows.
-
-    It is not written in chunks, and its index comes last: whatever lies on the disk when the power
-    fails can be read, up to the last whole message.
-    """
+    """A growing MCAP file without chunks, its index last: readable after a power failure."""
 
     def __init__(self, path: Path, run: Mapping[str, Any]) -> None:
         """Open a new file; raise OSError if it exists or cannot be written."""

@@ -281,10 +281,7 @@ UNSEEN: Final = 1 << 30
 
 
 class Meshes(NamedTuple):
-    """The meshes of an arena as kernels take them: k that stand somewhere.
-
-    Hills are one of them, the last, which no obstacle is a part of.
-    """
+    """The k placed meshes of an arena for kernels; hills are the last, without an obstacle."""
 
     bvh: Bvh
     owner: NDArray[np.int32]

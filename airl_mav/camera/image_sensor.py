@@ -1,7 +1,4 @@
-"""What a lens and an image sensor make of light: vignetting, colour mosaic, photon noise, numbers.
-
-Light is linear, 1 is white. Pure functions, with numpy: the twin and the rehearsal call the same.
-"""
+"""Lens and image sensor: vignetting, colour mosaic, photon noise, numbers; linear, 1 is white."""
 
 from __future__ import annotations
 

@@ -1,10 +1,9 @@
 """Rain on the lens: drops that show the scene upside down, small and out of focus.
 
-A drop is a strong lens before the camera's own, and too near to be sharp. So it shows what lies
-around it, turned upside down, over a soft edge (Porav, Bruls and Newman, I can see clearly now:
-image restoration via de-raining, ICRA 2019, make such images with glass and water). Here a drop is
-an ellipse whose edge is as far out of focus as `_SOFT` says, and whose point at (a, b), in its own
-half axes, shows the mean of nine points around (-a, -b) of `_REACH` of the image's width.
+A drop is a strong lens, too near to be sharp: it shows its surroundings upside down with a soft
+edge (Porav, Bruls and Newman, I can see clearly now: image restoration via de-raining, ICRA 2019).
+Here it is an ellipse with an edge blurred by `_SOFT`, whose point at (a, b), in its own half axes,
+shows the mean of nine points around (-a, -b) of `_REACH` of the image's width.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
-"""Which of an image's points a mesh hides from the sun: rays through its tree.
+"""Shadows of meshes on an image's points: parallel rays through their trees.
 
-The rays of all points have one direction. Where a mesh is seen itself, those begin a little above
-its surface, on the side that is seen, and none are cast where that faces away from the sun.
+Rays from meshes begin slightly above the visible side; sides away from the sun need none.
 """
 
 from __future__ import annotations

@@ -1,10 +1,7 @@
-"""An arena and a camera as a scene of Mitsuba 3: path tracing, the reference of `colour`.
+"""Arenas and cameras as scenes of Mitsuba 3: path tracing, the reference of `colour`, without fog.
 
-Light goes as far as it does: shadows of the sky in corners, colour that one surface throws onto
-another. None of this is in the fast images, but for the means below a ceiling. Fog is not here.
-
-Its cameras are pinholes: images of cylinders and fisheyes are resampled from those of the faces of
-a cube (`cube_faces`), while they are still light.
+It adds ambient occlusion and colour bleeding, of which the fast images only have means below a
+ceiling. Cylinders and fisheyes are resampled from pinholes (`cube_faces`) in linear light.
 """
 
 from __future__ import annotations

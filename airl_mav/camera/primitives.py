@@ -1,7 +1,4 @@
-"""The inverse depth of one body along the lines of an image: room, box, cylinder, sphere.
-
-How it is worked out says `raycast`, which puts the bodies together.
-"""
+"""Inverse depth of a room, box, cylinder or sphere along the lines of an image; see `raycast`."""
 
 from __future__ import annotations
 

@@ -53,10 +53,7 @@ class Pose(NamedTuple):
 
 
 class Bent(NamedTuple):
-    """The unit rays of an image that is not affine along its lines: a fisheye's.
-
-    Shares of the axes of `Pose` in each ray; none at all in pixels that see nothing.
-    """
+    """Unit rays of a fisheye as shares of `Pose`'s axes; zero in pixels that see nothing."""
 
     forward: NDArray[np.float64]  # (n, m)
     across: NDArray[np.float64]  # (n, m)

@@ -1,7 +1,4 @@
-"""What one point of a surface looks like: light, texture, fog, and the sRGB number of a pixel.
-
-Everything is in float32, without branches, so that the loops that inline it vectorise.
-"""
+"""Light, texture, fog and sRGB of one point, in branch-free float32, to be vectorised inline."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Sky, floor, walls and obstacles in colour, each where the image sees them.
+"""Sky, floor, walls and obstacles in colour, as seen in an image.
 
-Images are one line after the other here. They are shaded in blocks, in three steps: where points
-lie in the pattern and how they face the light, then the texels, then the colours.
+Images are shaded in blocks of consecutive lines: pattern places and light, then texels, then
+colours.
 """
 
 from __future__ import annotations

@@ -1,11 +1,7 @@
-"""Textures: patterns of numbers 0..1 that repeat, with their coarser levels (mip maps).
+"""Textures: repeating patterns of numbers 0..1 with coarser levels (mip maps).
 
-A procedural pattern is a function of nothing but its name; a picture from a file is three patterns.
-What differs from surface to surface is where it begins, how large it is and between which albedos
-it mixes.
-
-What is read comes from a file that somebody else may have made: only two formats are tried, of a
-size that is known before any pixel is.
+A procedural pattern depends on its name alone; a picture from a file is three patterns. Surfaces
+differ in offset, size and albedos. Files are untrusted: two formats, of a size checked first.
 """
 
 from __future__ import annotations

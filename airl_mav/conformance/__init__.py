@@ -1,4 +1,4 @@
-"""Does a flight controller behave on the wire as the rehearsal assumes? One run for any firmware.
+"""Conformance test of a flight controller: does it behave as the rehearsal assumes?
 
 `check_conformance` makes the checks of `ground_checks` and `flight_checks` on a `Vehicle` in their
 order, flies the step responses of `steps`, and lands whatever happens.

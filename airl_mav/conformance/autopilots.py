@@ -1,7 +1,4 @@
-"""What PX4 and ArduPilot are expected to do on the wire where they differ.
-
-Measured on PX4 1.16 and ArduCopter 4.7 SITL; docs/conformance.md has the table.
-"""
+"""Measured differences of PX4 1.16 and ArduCopter 4.7 SITL; see docs/conformance.md."""
 
 from __future__ import annotations
 

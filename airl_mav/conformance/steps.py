@@ -1,7 +1,7 @@
-"""The step responses that are flown, how each is read from telemetry, and its figures.
+"""Step responses, their telemetry and figures.
 
-A value counts as reached in the first sample that shows it: no interpolation between samples, as
-the stored columns were measured. So each time is late by up to one sample.
+A value counts as reached in the first sample that shows it, up to one sample late, as in the stored
+columns.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """The vehicle under test: MAVSDK's calls, and raw messages through MAVSDK.
 
-Waits follow the vehicle's own clock, so that they mean the same at any speed of a simulation; its
-silence is measured by the wall clock.
+Timeouts follow the vehicle's clock, at any simulation speed; silence is measured by the wall clock.
 """
 
 from __future__ import annotations
@@ -269,10 +268,7 @@ class RawSetpoint(NamedTuple):
 
 
 class SetpointStream:
-    """Repeats the newest raw setpoint until the context ends, or it is stopped.
-
-    It stops while heartbeats go on, which MAVSDK's own repetition cannot.
-    """
+    """Repeats the newest raw setpoint until stopped, heartbeats or not, unlike MAVSDK."""
 
     def __init__(self, vehicle: Vehicle, setpoint: RawSetpoint) -> None:
         self._vehicle, self._setpoint = vehicle, setpoint

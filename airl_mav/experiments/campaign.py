@@ -1,7 +1,6 @@
 """Campaigns: the evaluations of an experiment, flown by one executor, each into its run folder.
 
-The jobs of all cells go to the executor one after the other, so that no worker waits for the end of
-a cell. A folder is opened, and locked, when the first of its jobs is taken.
+Jobs of all cells follow each other without a wait; a folder is locked from its first job on.
 """
 
 from __future__ import annotations

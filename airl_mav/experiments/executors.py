@@ -1,8 +1,4 @@
-"""Executors: who carries out the jobs of an experiment.
-
-The same job gives the same results whoever carries it out: this process, worker processes
-(`process_executor`) or the workers of a Ray cluster (`ray_executor`).
-"""
+"""Executors of jobs: this process, worker processes or a Ray cluster, with equal results."""
 
 from __future__ import annotations
 
@@ -91,10 +87,7 @@ class Executor(Protocol):
 
 
 class InProcessExecutor:
-    """This process, one job after the other; results are yielded while a job goes on.
-
-    An error that is no UsageError is raised as it is.
-    """
+    """This process, job by job; results are streamed and errors raised as they are."""
 
     workers: ClassVar[int] = 1
     streams: ClassVar[bool] = True

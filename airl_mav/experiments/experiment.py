@@ -1,7 +1,4 @@
-"""An experiment: named scenarios, flown on the same seeds, and how they are compared.
-
-`evaluate`, `gap`, `ladder` and `degrade` declare experiments; this flies and compares them.
-"""
+"""Experiments: named scenarios of `evaluate`, `gap`, `ladder` or `degrade`, flown and compared."""
 
 from __future__ import annotations
 

@@ -138,10 +138,7 @@ def navigation_of(
 
 @dataclass(frozen=True)
 class GymFlier:
-    """Flies the episodes of a scenario in the batch twin. Implements `fliers.Flier`.
-
-    A flight depends on its seed alone, not on the slots or on what flies beside it.
-    """
+    """Flies episodes in the vectorized simulator, whatever the slots. Implements `Flier`."""
 
     scenario: ResolvedScenario
 

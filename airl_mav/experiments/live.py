@@ -1,7 +1,4 @@
-"""Flights one after the other, for somebody who looks on: what `airl-sitl` does.
-
-Light to import, so that the processes of a rehearsal are started at once.
-"""
+"""Flights one after the other for `airl-sitl`; light to import, to start processes at once."""
 
 from __future__ import annotations
 

@@ -34,10 +34,7 @@ END_S = 5.0
 
 
 class ProcessExecutor:
-    """Worker processes of this machine, at most `workers` at a time, one thread each.
-
-    They live on from run to run, until the executor is closed: a context manager does that.
-    """
+    """At most `workers` worker processes of one thread each, which serve several runs."""
 
     streams: ClassVar[bool] = False
 

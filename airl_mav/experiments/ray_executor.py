@@ -1,8 +1,4 @@
-"""Jobs as tasks of a Ray cluster, or of a Ray started on this machine.
-
-Ray places the tasks on its nodes. A task whose worker or node is lost begins again, here and not
-inside Ray, so that a person hears of it.
-"""
+"""Jobs as tasks of a Ray cluster, or of a local Ray; lost tasks restart here, with a message."""
 
 from __future__ import annotations
 

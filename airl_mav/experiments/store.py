@@ -1,10 +1,9 @@
-"""The folder of a campaign: many evaluations or trainings that belong together, resumable.
+"""The folder of a campaign: resumable evaluations or trainings that belong together.
 
-campaign.json   the declaration: the cells, what is compared with what, the settings
-<cell>/         the run folder of an evaluation, the training folder of a trial
+    campaign.json   the declaration: the cells, comparisons, settings
+    <cell>/         the run folder of an evaluation, the training folder of a trial
 
-The declaration is written before anything begins, whole or not at all. What is done is known from
-the folders of the cells alone, so that a campaign that is killed at any moment goes on.
+The declaration is written first and atomically. The cells' folders alone say what is done.
 """
 
 from __future__ import annotations

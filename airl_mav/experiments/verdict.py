@@ -1,8 +1,7 @@
-"""`airl verdict`: fly until it is decided whether a policy holds on an onboard computer.
+"""`airl verdict`: a group-sequential test of a policy's success rate on an onboard computer.
 
-Flights are added in steps, and after each step the success rate is tested in a way that allows for
-all of these looks (`flight.sequential`). What is required besides is judged once, on the flights
-that this took.
+The success rate is tested after each batch of flights (`flight.sequential`), other requirements
+once at the end.
 """
 
 from __future__ import annotations

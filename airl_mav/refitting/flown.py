@@ -29,11 +29,7 @@ OFFBOARD = 14
 
 @dataclass(frozen=True)
 class Flown:
-    """A recorded flight.
-
-    Times are the companion's, but for those of the log; of a flight that only the log tells, they
-    are the log's as well.
-    """
+    """A recorded flight in the companion's time; log times where there is only a log."""
 
     path: Trajectory
     """As telemetry told it, or the log."""

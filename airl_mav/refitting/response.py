@@ -1,8 +1,6 @@
-"""How the vehicle answered the setpoints: dead time, time constants of velocity and yaw rate.
+"""Fit of a vehicle's response to setpoints: dead time, time constants of velocity and yaw rate.
 
-The model is that of `prediction.motion`: after a dead time the velocity follows the setpoint with
-one time constant, the yaw rate with another. Its velocity is the flight's when it is driven by the
-setpoints that were sent, turned by the heading that was flown.
+The model is that of `prediction.motion`, driven by the sent setpoints and the flown heading.
 """
 
 from __future__ import annotations

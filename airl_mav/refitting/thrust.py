@@ -1,9 +1,8 @@
 """Thrust per mass, from motor commands and the accelerometer along the body's axis.
 
-Along the body's up axis the accelerometer feels thrust / m less the drag's part. Motor commands
-tell the thrust as a share of the greatest, so the ratio of the two over a flight is thrust_max / m:
-never the one or the other alone. Means over the whole flight cancel the rotors' lag and vibration,
-and leave what is wrong with the accelerometer's bias that the estimator has learnt.
+The accelerometer measures thrust / m less the drag's part, motor commands the share of maximum
+thrust, so that their ratio is thrust_max / m. Means over the flight cancel rotor lag and vibration,
+not an error of the learnt accelerometer bias.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""A report as headings, tables and pictures: one HTML page that opens offline, Markdown, terminal.
-
-Comparisons and sweeps are documents; the page of a single run has a template of its own.
-"""
+"""Reports of headings, tables and pictures: an offline HTML page, Markdown, or terminal output."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
-"""What the policy saw and chose, decision by decision, worked out again from what was recorded.
+"""The policy's inputs and choices, recomputed decision by decision from a recording.
 
-No images are recorded. They are rendered again from the true pose at their exposure, without the
-camera's noise, by the ray caster that rendered them in flight; telemetry is the recorded estimate.
-A learned policy is asked again what it makes of that.
+Images are rendered from the true pose at exposure, without noise, by the ray caster of the flight;
+telemetry is the recorded estimate. A learned policy is evaluated again on both.
 """
 
 from __future__ import annotations

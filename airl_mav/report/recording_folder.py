@@ -1,8 +1,7 @@
 """The run folder of a black box, beside it, which every report and comparison reads.
 
-The path is the estimate at the rate of the log's attitude, the power that of its battery monitor,
-and the motor outputs are there. The log's times become those of the companion's clock; as those of
-NTP, they take both ways on the link for equally long (D. Mills, RFC 5905, section 8).
+Path, power and motor outputs come from the vehicle's log. Its clock is aligned as by NTP, assuming
+equal delays both ways (D. Mills, RFC 5905, section 8).
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Flights in three dimensions: figures for the plotly library, which travels inside the page.
-
-Frame of the figures: x east, y north, z up [m] from the start.
-"""
+"""Three-dimensional figures of flights for the page's plotly: x east, y north, z up [m]."""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""Figures that follow the reader's light or dark setting.
-
-A figure is drawn once, in the light colours. As SVG its colours become CSS variables with a dark
-value each; as PNG it stays light, for slides and papers.
-"""
+"""Figures that follow the reader's light or dark setting: SVG by CSS variables; PNG is light."""
 
 from __future__ import annotations
 

@@ -1,8 +1,6 @@
-"""The verdict: the first line of every output, and what a CI job reads of it.
+"""The verdict: flown setup, goals reached, and each requirement met, not met or undecided.
 
-It says what flew, on what, and how many goals it reached; then, of each requirement, whether the
-flights meet it, do not meet it, or are too few to tell. Written as `verdict.json`, JUnit XML and a
-badge.
+It is the first line of every output, and `verdict.json`, JUnit XML and a badge for CI.
 """
 
 from __future__ import annotations

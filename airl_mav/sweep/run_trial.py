@@ -1,8 +1,4 @@
-"""Carry out a trial: train, choose the best weights, export them, fly them, write the result.
-
-Every part is there to be killed: training goes on from its newest checkpoint, what comes after it
-is done again in seconds, and the result appears whole.
-"""
+"""A resumable trial: train, choose the best weights, export them, fly them, write the result."""
 
 from __future__ import annotations
 

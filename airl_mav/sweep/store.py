@@ -1,13 +1,12 @@
 """The folder of a sweep: a campaign (`experiments.store`) whose cells are the trials.
 
-campaign.json           what was asked for
-sweep.json              every result and network so far
-sweep.md, .html, .png   the same for people
-<trial>/                a training folder (`training.store`), and of the sweep:
-    result.json         what came out: its being there is what ends a trial
+    campaign.json           the search space
+    sweep.json              every result and network so far
+    sweep.md, .html, .png   the same for people
+    <trial>/                a training folder (`training.store`), and of the sweep:
+        result.json         the result: its presence ends a trial
 
-A trial is carried out by whoever gets it, in whatever process, on whatever machine sees the
-folder, and goes on where the last one was cut off.
+Any process on any machine that sees the folder can run a trial or resume it.
 """
 
 from __future__ import annotations

@@ -1,12 +1,8 @@
 """Checkpoints: everything that a training run needs to resume exactly.
 
-A checkpoint is a folder. It is written under another name, brought to the disk and renamed; then
-the file `latest` names it. Whenever the process dies, a whole one lies there. Save between two
-rollouts only (stable-baselines3's `on_rollout_start`): within one, part of the state is in local
-variables.
-
-Nothing is unpickled: weights are read with `weights_only`, arrays without objects, the rest is
-JSON.
+A checkpoint is a folder, written under another name, synced and renamed; then the file `latest`
+names it, so that there is always a whole one. Save between two rollouts only (stable-baselines3's
+`on_rollout_start`): within one, part of the state is in local variables. Nothing is unpickled.
 """
 
 from __future__ import annotations

@@ -36,10 +36,10 @@ NOT_ASIDE = -1
 
 
 class Batch(NamedTuple):
-    """Samples of n-step transitions; every array has a leading axis (batch,).
+    """Samples of n-step transitions, arrays (batch, ...).
 
-    A target is `returns + discounts * value(next_observations)`. `discounts` is gamma^k for a chain
-    of k rewards, 0 where the episode terminated.
+    A target is `returns + discounts * value(next_observations)`; `discounts` is gamma^k for k
+    rewards, 0 after the end of an episode.
     """
 
     observations: Encoded
@@ -53,10 +53,10 @@ class NStepReplay:
     """The memory.
 
     Args:
-        steps: Transitions to remember, of all vehicles together.
-        vehicles: Vehicles a row.
-        shapes: Shape and type of each array of an observation, without the leading axis.
-        n_step: Rewards that a chain sums at most.
+        steps: Capacity in transitions of all vehicles together.
+        vehicles: Vehicles per row.
+        shapes: Shape and type of each array of an observation.
+        n_step: Maximum rewards of a chain.
         gamma: Discount of one step.
     """
 
@@ -197,8 +197,8 @@ class NStepReplay:
 class DoubleDQN(DQN):
     """DQN with double Q-learning, n-step returns and Dict observations of n vehicles.
 
-    All intervals count steps of single vehicles, whatever their number. Vehicles explore each for
-    itself. One generator draws exploration and samples, so that a run can be continued exactly.
+    Intervals count steps of single vehicles. Vehicles explore independently. One generator draws
+    exploration and samples, so that a run can be resumed exactly.
 
     Args:
         policy: "MultiInputPolicy".
@@ -207,7 +207,7 @@ class DoubleDQN(DQN):
         double: Choose the next action with the online network, not with the target network.
         env_steps_per_update: Steps for each update.
         target_update_interval: Steps between two updates of the target network.
-        precision: Numbers of the networks' passes; weights and their updates stay float32.
+        precision: Number format of the networks' passes; weights and updates stay float32.
         arguments: Further arguments of stable-baselines3's DQN.
     """
 

@@ -79,9 +79,8 @@ def flat_size(spec: NetworkSpec, height_px: int, width_px: int) -> int:
 class ImageExtractor(BaseFeaturesExtractor):
     """Convolutions over the image, joined with `velocity`, `goal` and others.
 
-    The image is `depth`, `rgb` or `grey` (n, channels, height, width). It comes in scaled
-    to 0..1, which stable-baselines3 does with uint8 images. Images of further cameras have
-    convolutions of their own, of the same kind.
+    The image is `depth`, `rgb` or `grey` (n, channels, height, width), scaled to 0..1 by
+    stable-baselines3. Images of additional cameras have their own, similar convolutions.
     """
 
     def __init__(self, observation_space: spaces.Dict, spec: NetworkSpec) -> None:

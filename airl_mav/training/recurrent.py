@@ -1,7 +1,6 @@
 """Recurrent policies of sb3-contrib: the part that decides, with its memory as inputs and outputs.
 
-The LSTM is written out as one step of its equations: an export then has nothing but products and
-sums, any number of rows, and the memory has its rows first, as everything else has.
+The LSTM is unrolled to one step, so that an export has only products and sums and any batch size.
 """
 
 from __future__ import annotations
@@ -106,10 +105,7 @@ class RecurrentOfAny(RecurrentNetwork):
 
 
 class GreedyDecisions:
-    """The decisions of a learner without exploration, n flights at a time.
-
-    A recurrent one remembers each flight from `began` on; any other has no memory.
-    """
+    """Greedy decisions of a learner, n flights at a time; `began` resets a flight's memory."""
 
     def __init__(self, model: BaseAlgorithm) -> None:
         self._model = model

@@ -1,7 +1,4 @@
-"""A training run: learning, evaluations, checkpoints, and the export of the best weights.
-
-All that is not learning happens between two rollouts, where a run can be resumed exactly.
-"""
+"""Training runs: learning, and between rollouts evaluations, checkpoints and exports."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """Table of the learning algorithms and their hyperparameters.
 
-`[algorithm]` of a training file has the fields that algorithms share, `[algorithm.options]` those
-of one alone, under the names that stable-baselines3 and sb3-contrib give them. What is left out is
-their default, or `Algorithm.defaults`.
+`[algorithm]` of a training file has the common fields, `[algorithm.options]` the specific ones, by
+the names of stable-baselines3 and sb3-contrib, with their defaults or `Algorithm.defaults`.
 """
 
 from __future__ import annotations

@@ -1,9 +1,7 @@
-"""A training that is watched: the newest flights of one of its vehicles, shown in a view.
+"""View of a training: the newest episode of its first vehicle, flown again.
 
-The training keeps the seed and the actions of its first vehicle's episodes, and nothing else: a
-flight is the same however many fly beside it, so a thread of its own flies the newest one again, at
-the pace that its watchers have set, and shows it. Flights that end meanwhile are passed over.
-Nothing that learns waits for it, or draws another number.
+Training only records that vehicle's seeds and actions; flights do not depend on others beside them,
+so a separate thread repeats them at the viewers' pace, skipping some. Learning is not affected.
 """
 
 from __future__ import annotations

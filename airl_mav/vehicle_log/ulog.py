@@ -1,8 +1,4 @@
-"""Reading PX4's log of a flight, as far as a companion's recording lacks it.
-
-Topics and fields are those of PX4 1.14 to 1.16. Times are the flight controller's, from its boot
-[µs]; the world is NED, the body FRD.
-"""
+"""Reader of PX4's log of a flight, versions 1.14 to 1.16; times since boot [µs], NED and FRD."""
 
 from __future__ import annotations
 

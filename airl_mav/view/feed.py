@@ -1,7 +1,4 @@
-"""How snapshots reach the view, and what its watchers ask for reaches the flight: ZeroMQ.
-
-Nobody waits: what a view that hangs or is gone cannot take is dropped.
-"""
+"""ZeroMQ link between flight and view; nobody waits: messages to a hanging view are dropped."""
 
 from __future__ import annotations
 

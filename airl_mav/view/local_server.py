@@ -1,8 +1,7 @@
-"""viser's server, for pages of this computer alone.
+"""viser's server restricted to pages of this computer.
 
-A browser lets every web page open a WebSocket to 127.0.0.1, and says in its `Origin` whose page it
-is. viser takes any, and opens a public tunnel to itself when one asks: a page that is open beside
-the view could pause flights, change their latency, or show them to the internet.
+Any web page may open a WebSocket to 127.0.0.1, with its `Origin`. viser accepts all of them and
+opens public tunnels on request: a foreign page could change flights or publish them.
 """
 
 from __future__ import annotations

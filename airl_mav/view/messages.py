@@ -1,4 +1,4 @@
-"""What a flight tells its view: small snapshots of pure data, and their bytes on the wire.
+"""Messages from a flight to its view, and their bytes on the wire.
 
 Positions and velocities are local NED [m, m/s], attitudes body FRD -> NED [w, x, y, z], times
 simulated [µs]. A message is one part of JSON; an image follows as a second part: little-endian

@@ -1,7 +1,6 @@
-"""The pace of a flight in lockstep, as its watchers ask for it: speed, pause, decision by decision.
+"""Pace of a lockstep flight by its viewers: speed, pause, single steps.
 
-Only wall time passes here. Simulated time stands still meanwhile, and a flight is the same, bit by
-bit, at every pace.
+Only wall time passes here; the flight stays bit-identical.
 """
 
 from __future__ import annotations

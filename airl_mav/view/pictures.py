@@ -1,7 +1,4 @@
-"""What the panel shows, as pure functions: the camera's images, numbers and texts as HTML.
-
-It would take longer to import than all else that a page needs before it shows a flight.
-"""
+"""Images, numbers and texts of the panel as pure functions; imported late, as that takes long."""
 
 from __future__ import annotations
 

@@ -1,8 +1,4 @@
-"""The scene in three dimensions: arena, vehicle, trail, arrows, camera.
-
-The scene's frame is the world's, local NED, with up = -z; the vehicle's parts are in its body
-frame FRD.
-"""
+"""The scene in three dimensions, local NED with up = -z; the vehicle's parts are FRD."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""The view's process: takes snapshots in, draws them for all who watch, says what they ask for.
+"""The view's process: draws snapshots for all viewers and returns their requests.
 
-Its first line of input is a `Request`, its first line of output an `Answer`. It ends when its
-input does: with the run.
+Its first line of input is a `Request`, its first line of output an `Answer`. It ends when its input
+does: with the run.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ FIRST_MS = 400
 class Controls:
     """The controls of one page.
 
-    What viser calls is a coroutine: it runs before the next message of a page is read. A function
-    would run in a thread of a pool, and read what another click has made of the control since.
+    Callbacks are coroutines, which run before the page's next message; functions would run in a
+    pool and read a later state of the control.
     """
 
     def __init__(self, gui: Any, steering: Steering) -> None:

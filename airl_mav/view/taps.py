@@ -163,10 +163,7 @@ class SimulationTap:
 
 
 class CompanionTap:
-    """Shows a companion's decisions, and lets the watchers change how late they are.
-
-    All calls from one thread.
-    """
+    """Shows a companion's decisions and applies the viewers' latency; called from one thread."""
 
     def __init__(self, ends: ViewEnds, scenario: ResolvedScenario) -> None:
         """Connect to a view."""

@@ -1,8 +1,7 @@
-"""What a camera driver is, and the thread that keeps its newest image as a frame.
+"""Interface of camera drivers, and the thread that keeps their newest image as a frame.
 
-A driver is a class made without arguments. It has a `lens`, and `read` waits for the next image.
-Everything else (the thread, the time stamps, the size that the policy was trained with) is done
-here, once for every camera.
+A driver is a class made without arguments, with a `lens` and `read`; time stamps, size and threads
+are handled here.
 """
 
 from __future__ import annotations
@@ -69,10 +68,7 @@ class DepthImage(NamedTuple):
 
 
 class DepthCamera(Protocol):
-    """A camera of the companion computer's.
-
-    One that returns further images also has `lenses`: a `Lens` for each, by name.
-    """
+    """A camera of the companion computer; `lenses` names the lenses of additional images."""
 
     @property
     def lens(self) -> Lens:

@@ -1,7 +1,7 @@
 """Luxonis OAK-D stereo cameras, through depthai (the extra `oak`).
 
-The camera matches its two images itself and sends depth. What is expected of it is what the vehicle
-profile `quad-oak-d` says: 640 x 400 pixels, disparities up to 95 px in steps of an eighth.
+The camera matches on its own, as in the profile `quad-oak-d`: 640 x 400 pixels, disparities up to
+95 px in steps of an eighth.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Intel RealSense depth cameras, through librealsense (the extra `realsense`), and its recordings.
-
-The sensor is opened by itself, without a pipeline: a queue of one frame keeps the newest.
-"""
+"""Intel RealSense depth cameras and recordings, through librealsense (the extra `realsense`)."""
 
 from __future__ import annotations
 

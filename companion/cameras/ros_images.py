@@ -1,8 +1,4 @@
-"""Depth images and camera parameters of ROS 2 messages, however they came here.
-
-Messages are read by the names of their fields alone, so that those of rosbags, of `rclpy` and of
-any other decoder do.
-"""
+"""Depth images and camera parameters of ROS 2 messages from any decoder, read by field names."""
 
 from __future__ import annotations
 

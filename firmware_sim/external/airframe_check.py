@@ -1,8 +1,4 @@
-"""Checks on the ground that external firmware is configured for the vehicle that it flies.
-
-A wrong motor order flips a vehicle as it lifts off, and its log then shows only saturated
-controllers.
-"""
+"""Ground check of external firmware's configuration: a wrong motor order flips the vehicle."""
 
 from __future__ import annotations
 

@@ -13,10 +13,7 @@ def no_process() -> None:
 
 
 class Bridge(Protocol):
-    """One simulator interface, for one flight of one firmware.
-
-    It does not handle the firmware's MAVLink (mode, texts, parameters).
-    """
+    """One flight's simulator interface of one firmware, without its MAVLink."""
 
     rate_hz: int
     """Sensor samples that the firmware needs per second of simulated time."""

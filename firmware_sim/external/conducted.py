@@ -1,7 +1,6 @@
-"""PX4 SITL for a companion that is conducted: the companion's link, and an instance of its own.
+"""PX4 SITL for a conducted companion: the companion's link, and its own instance.
 
-Nothing here lives by the wall clock but the boot of PX4: an answer is waited for as long as it
-takes, so that a busy host slows a flight down and never ends it.
+Only PX4's boot runs by the wall clock; a busy host slows a flight down but never ends it.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Observes external firmware on a MAVLink link of its own: its state, texts and parameters.
+"""Observer of external firmware on a separate MAVLink link: state, texts and parameters.
 
-It sends no commands in flight: companion and ground station talk to the firmware directly.
+Companion and ground station command the firmware directly.
 """
 
 from __future__ import annotations

@@ -1,8 +1,6 @@
-"""The process of external firmware and its working folders, behind the parent-death guard.
+"""Process of external firmware, its working folders, and the parent-death guard.
 
-Neither PX4 nor ArduPilot ends by itself when its simulator is gone.
-
-Where the operating system does not tell (/proc is Linux's), nothing is known of it.
+PX4 and ArduPilot do not end with their simulator. Process states are known on Linux only (/proc).
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Programs of real firmware: are they there, and how does the user start them?
-
-Light to import: whoever starts a rehearsal asks before anything that flies is loaded.
-"""
+"""Presence and start commands of real firmware, checked before heavy imports."""
 
 from __future__ import annotations
 

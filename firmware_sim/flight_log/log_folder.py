@@ -19,10 +19,7 @@ OPEN_FILES = 8
 
 
 class LogFolder:
-    """Complete logs by their names, then the one that is being written. Implements `LogStore`.
-
-    What is in the folder is looked at again when the folder has changed.
-    """
+    """Complete logs by name, then the open one; rescans changed folders. Implements `LogStore`."""
 
     def __init__(self, folder: Path, current: FlightLog) -> None:
         """Take the folder, and the log that is being written in it."""

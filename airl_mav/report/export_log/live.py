@@ -27,10 +27,7 @@ BACKLOG = 1024
 
 
 class LiveFlight(ServerListener):
-    """A server that publishes a flight, from its beginning once somebody watches.
-
-    Who comes later gets at once what is told only now and then: the newest message of each topic.
-    """
+    """Server of a flight from its first viewer on; later ones get each topic's newest message."""
 
     def __init__(self, flight: RecordedFlight, port: int) -> None:
         """Serve on a loopback TCP port, 0 = any free one; raise FieldError if it is taken."""

@@ -1,10 +1,7 @@
 """The scene of a flight in Foxglove's primitives: arena, goal, path, vehicle, velocities.
 
-What stands in a message of its own topic is there at any time that a viewer jumps to: viewers load
-the newest message of each topic.
-
-Foxglove's 3-D panel has z up and x, y level; ours becomes the frame `world`, ENU: x east, y north,
-z up. Bodies are FLU: x forward, y left, z up. `core.frames` converts.
+Viewers that seek load the newest message of each topic. Foxglove's frame `world` is ENU: x east, y
+north, z up. Bodies are FLU: x forward, y left, z up. `core.frames` converts.
 """
 
 from __future__ import annotations

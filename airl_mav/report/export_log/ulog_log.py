@@ -1,7 +1,6 @@
-"""A flight as a ULog, for a level that has no flight controller's own log.
+"""Flights without a flight controller's own log as ULog, with the topics of `flight_log.topics`.
 
-Topics are those of the vehicle's own log (`firmware_sim.flight_log.topics`), as far as a run folder
-holds them. A field that is not known is NaN, or 0 where it is no float.
+Unknown fields are NaN, or 0 if they are integers.
 """
 
 from __future__ import annotations

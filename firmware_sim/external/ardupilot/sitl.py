@@ -1,13 +1,8 @@
 """ArduPilot SITL behind our plant: its JSON simulator interface over UDP, in lockstep.
 
 ArduPilot sends a servo packet, waits for one state line, advances to the line's time and sends the
-next packet. It sends the same packet again after a second without an answer.
-
-Whether it is armed does not travel on this interface: `armed` is whether a motor is commanded to
-turn. ArduCopter turns an armed vehicle's motors on the ground, too (MOT_SPIN_ARM).
-
-Source: ArduPilot libraries/SITL/SIM_JSON.cpp, checked against a running ArduCopter 4.7.
-
+next packet. It repeats a packet after a second without an answer. The interface lacks the armed
+state: `armed` means that a motor turns, which ArduCopter's do on the ground too (MOT_SPIN_ARM).
 Source: ArduPilot libraries/SITL/SIM_JSON.h and .cpp, checked against a running ArduCopter 4.7.
 """
 

@@ -166,10 +166,7 @@ _MAVLINK_VERSION = 3
 
 
 class BoardLink:
-    """One board on one device, which may vanish and come back while it reboots.
-
-    Nothing is sent to a board before something was received from it.
-    """
+    """A board that may vanish during a reboot; nothing is sent before something was received."""
 
     def __init__(self, router: Router, device: str, baud: int) -> None:
         """Configure a serial line for a router with lasting clients; UsageError if too slow."""

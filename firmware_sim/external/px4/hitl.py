@@ -61,11 +61,9 @@ class Pace:
 class HitlBridge:
     """Flies one board for one episode. Implements `Bridge`.
 
-    The flight ends (`FirmwareLostError`) when the device vanishes, when motor commands cease, when
-    the board restarts or leaves HIL mode, or when its commands are invalid.
-
-    Nothing is sent to a board before it sends something, no sensors before it reports HIL mode, and
-    never HIL_STATE_QUATERNION, which a board takes for its own estimate.
+    A lost device, missing or invalid motor commands, a restart or leaving HIL mode end the flight
+    (`FirmwareLostError`). Sensors are sent once HIL mode is reported, HIL_STATE_QUATERNION never: a
+    board takes it for its own estimate.
     """
 
     rate_hz = TICK_HZ

@@ -60,14 +60,10 @@ _COMMAND = dialect.MAVLINK_MSG_ID_COMMAND_LONG
 class Px4Bridge:
     """Flies PX4 SITL: it gets HIL_SENSOR and answers each with one HIL_ACTUATOR_CONTROLS.
 
-    Implements `Bridge`. PX4's clock is HIL_SENSOR's time: while it is being waited for, its time
-    stands still. It answers nothing before it has booted; until then samples are sent no faster
-    than they would be measured, and motors are stopped.
-
-    Disarmed it may leave samples unanswered for a while. Anything else ends the flight
-    (`FirmwareLostError`): PX4 silent for too long, its connection closed, its clock jumping back
-    (it restarted) or ahead, garbage, invalid motor commands. A second answer to a sample is
-    dropped; a second connection is refused.
+    Implements `Bridge`. PX4's clock is HIL_SENSOR's time. Before its first answer samples are sent
+    at their nominal rate and motors are stopped. Disarmed it may skip answers for a while. Silence,
+    a closed connection, clock jumps, garbage or invalid motor commands end the flight
+    (`FirmwareLostError`). Second answers are dropped, second connections refused.
     """
 
     rate_hz = TICK_HZ

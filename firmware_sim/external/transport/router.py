@@ -1,7 +1,6 @@
-"""Routes MAVLink between a board on one serial line and its clients over UDP.
+"""Router of MAVLink between a board on one serial line and its clients over UDP.
 
-The line carries both the simulator's messages, which are handled here, and the traffic of companion
-and ground station, which is forwarded unchanged, frame by frame.
+Simulator messages on the line are handled here; all other frames are forwarded unchanged.
 """
 
 from __future__ import annotations
@@ -126,10 +125,8 @@ class _Client:
 class Router:
     """Forwards frames whenever `pump` is called. Nothing blocks or raises; see `lost`.
 
-    The line may change (a board's USB device vanishes while it reboots), the clients stay.
-
-    For a listener in this process it is an endpoint, which is pumped between ticks. Implements
-    `Endpoint`.
+    Clients stay when the line changes (a USB device vanishes during a reboot). Listeners in this
+    process use it as an `Endpoint`, pumped between ticks.
     """
 
     datagrams = True
