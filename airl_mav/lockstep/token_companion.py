@@ -16,8 +16,7 @@ from companion.mavsdk_link import MavsdkLink
 from companion.mission import MissionResult, check_camera, fly_mission
 from companion.program import Mission
 from companion.signing_proxy import signed
-from companion.token_clock import TokenTurns
-from companion.tokens import TokenFrameSource
+from companion.token_clock import TokenFrameSource, TokenTurns
 
 ANSWER_TIMEOUT_S = 20.0
 """MAVSDK repeats a command that has not been answered for so long, four times at most [wall s]:
