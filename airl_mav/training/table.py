@@ -21,7 +21,7 @@ Declared = tuple[Any, Any]
 """Type and field of an option."""
 
 
-def _number(kind: Any, meaning: str, **bounds: float) -> Declared:
+def _number(kind: Any, meaning: str, **bounds: Any) -> Declared:
     return kind | None, quantity(meaning, "1", default=None, **bounds)
 
 
