@@ -207,12 +207,10 @@ class BlackBoxRecorder:
 
 
 def _numbers(state: Kinematics) -> Any:
-    """Return position, velocity and quaternion as plain numbers."""
     return tuple(map(_finite, (state.position, state.velocity, state.quaternion)))
 
 
 def _finite(values: Iterable[float]) -> Any:
-    """Return numbers as messages have them."""
     return tuple(float(value) if math.isfinite(value) else None for value in values)
 
 

@@ -107,7 +107,6 @@ class ZmqFrameSource:
         return self._newest
 
     def _redial(self) -> None:
-        """Make the connection anew."""
         self._silent = WallClock()
         with suppress(zmq.ZMQError):  # it has ended already
             self._socket.disconnect(self._endpoint)

@@ -47,7 +47,6 @@ class Finding(NamedTuple):
     what: str
     good: bool
     told: str
-    """What was seen, or what is wrong."""
 
 
 def check_on_ground(

@@ -32,7 +32,6 @@ class VehicleStatus(NamedTuple):
     offboard: bool
     """Whether it flies our setpoints; on ArduPilot GUIDED."""
     mode: str
-    """What it flies, in words."""
     battery: float | None = None
     """Charge that is left, 1 to 0; None: not told."""
 

@@ -42,7 +42,6 @@ REASONS = (
     *(*NOT_OURS, TELEMETRY_FROZEN, TELEMETRY_WRONG, CAMERA_FROZEN, CAMERA_WRONG),
     *(FRAMES_LATE, BATTERY_LOW, OUT_OF_BOUNDS, OUT_OF_TIME),
 )
-"""Every limit that can be broken."""
 
 MODE_KNOWN_S = 3.0
 """Time until a change of mode must have been reported [s]: three heartbeats of 1 Hz."""
@@ -90,7 +89,6 @@ class Ending(NamedTuple):
     reason: str
     """One of the constants of this module or of `interfaces`."""
     detail: str
-    """What was seen, in words."""
 
     def __str__(self) -> str:
         """Return it as a note."""
@@ -229,7 +227,6 @@ class VehicleLimits:
         return None
 
     def _moved(self, state: Kinematics, now_us: int) -> Ending | None:
-        """Return whether position and velocity contradict each other."""
         if self._before is None:
             self._before = state, now_us
             return None
@@ -295,7 +292,6 @@ class CameraLimits:
         return self._pictured(frame, state, now_us) or self._stamped(seen)
 
     def _stamped(self, seen: ReceivedFrame) -> Ending | None:
-        """Return whether frames come late, or their stamps jump."""
         last, self._last = self._last, seen
         behind_us = seen.received_us - seen.frame.capture_time_us
         if last is None or last.frame.sequence > seen.frame.sequence:
@@ -340,7 +336,6 @@ def _dead(image: NDArray[Any]) -> bool:
 
 
 def _reading(frame: Frame) -> str:
-    """Return what the first pixel reads, in words."""
     numbers = ", ".join(str(int(number)) for number in np.ravel(frame.image[0, 0]))
     return f"{numbers} mm" if frame.intrinsics.kind == "depth" else f"{numbers} of 255"
 

@@ -47,7 +47,6 @@ OFFBOARD_REPEAT_S = 0.05
 wants them at more than 2 Hz."""
 
 TEXT_CHARACTERS = 50
-"""Length of a STATUSTEXT."""
 
 ARM_RETRY_S = 0.5
 """Time between two requests to arm [s]."""
@@ -426,7 +425,6 @@ def _known(value: float) -> float | None:
 
 
 def _refusal(error: TelemetryError) -> str:
-    """Say why a stream was not granted."""
     if error.args[0] != TelemetryResult.TIMEOUT:
         return _reason(error)
     return (
@@ -436,6 +434,5 @@ def _refusal(error: TelemetryError) -> str:
 
 
 def _reason(error: Exception) -> str:
-    """Return MAVSDK's result name."""
     result = error.args[0] if error.args else error
     return str(getattr(result, "name", result)).lower().replace("_", " ")

@@ -50,13 +50,11 @@ class Decided(NamedTuple):
 
     seen: ReceivedFrame
     state: Kinematics
-    """What telemetry said when it began."""
     setpoint: Setpoint
     started_us: int
     ready_us: int
     sent_us: int
     held_until_us: int
-    """When its hold is to end."""
     held_before_us: int
     """When that of the decision before ended; `NO_STAMP` for the first."""
     expires_us: int | None
@@ -74,7 +72,6 @@ class Pilot:
     policy: Policy
     watchdog: Watchdog
     clock: Clock
-    """Simulated time."""
     settings: PilotSettings
     latency: LatencySampler | None = None
     """Where to draw t2 from, to fly as a slower computer; None = as fast as it is."""
@@ -96,7 +93,6 @@ class Pilot:
     """What further cameras showed them, by name."""
     log: DecisionLog = field(init=False)
     held_us: int = field(default=NO_STAMP, init=False)
-    """When the last hold ended."""
 
     def __post_init__(self) -> None:
         """Keep account of the decisions: the compensator's, where there is one."""
@@ -208,7 +204,6 @@ class Pilot:
         return None
 
     def _setpoint(self, action: AnyAction) -> Setpoint:
-        """Return what is sent for an action."""
         if not isinstance(action, Action):
             return action
         down = action.down_m_s
@@ -221,7 +216,6 @@ class Pilot:
     def _observe(
         self, seen: ReceivedFrame, state: Kinematics, goal: Goal, now_us: int
     ) -> Observation:
-        """Return what the policy sees: what is, or what will be when its action is sent."""
         frame, image = seen.frame, seen.frame.image
         age_us = np.array([age_of(seen, now_us)])
         if self.compensator is not None:

@@ -16,7 +16,6 @@ from companion.periodic import every
 MESSAGE = "ONBOARD_COMPUTER_STATUS"
 
 PERIOD_US = US_PER_S
-"""Time between two messages [µs]."""
 
 NOT_KNOWN_8, NOT_KNOWN_16, NOT_KNOWN_32 = 2**8 - 1, 2**15 - 1, 2**32 - 1
 """What says "not known" in fields of uint8, int16 and uint32 (common.xml)."""

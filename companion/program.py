@@ -63,7 +63,6 @@ class Mission:
     vehicle: VehicleProfile
     """The aircraft: what its camera is, and how it is mounted."""
     setup: Setup
-    """What flies on what, in words."""
 
     @property
     def mount_pitch_up_rad(self) -> float:

@@ -88,7 +88,6 @@ class TokenTurns:
         self._send_text(Phase(self._number, phase).text())
 
     def _end(self) -> None:
-        """Give the turn back for good."""
         self._give_back(TurnBack(self._number, ended=True))
         for _ in range(FAREWELL_S):
             given = self._next_given(1.0)
@@ -169,9 +168,7 @@ class TokenFrameSource:
 
     frames: FrameSource
     turns: TokenTurns
-    """What names them."""
     clock: Clock
-    """The companion's."""
     newest: ReceivedFrame | None = field(default=None, init=False)
 
     def latest(self) -> ReceivedFrame | None:

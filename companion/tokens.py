@@ -55,14 +55,12 @@ class TurnBack:
     """`D<number> [<wake_us> [<setpoints_sent> [event]]]`, or `D<number> end`: the turn is over."""
 
     number: int
-    """As given."""
     wake_us: int | None = None
     """When it wants the next turn [µs]; None: not stated."""
     setpoints_sent: int | None = None
     """Setpoints that it has sent so far, without repetitions; None: not stated."""
     event: Event = ""
     ended: bool = False
-    """There is no next turn."""
 
     def text(self) -> str:
         """Return the text."""
@@ -92,7 +90,6 @@ class Phase:
     """`P<number> <name>`: within its turn the companion has entered a phase of its mission."""
 
     number: int
-    """Of the turn."""
     name: str
 
     def text(self) -> str:

@@ -98,11 +98,9 @@ class Stream:
     model: str
     """Of the camera; at most 31 characters are told."""
     size_px: tuple[int, int]
-    """Width and height of the pictures."""
     rate_hz: float
     horizontal_fov_deg: float
     port: int
-    """UDP port that it is sent to."""
 
 
 def camera_information(stream: Stream) -> Fields:
@@ -294,7 +292,6 @@ class OnNetwork:
 
 
 def _vehicle(mavsdk: Mavsdk) -> Any:
-    """Return the system with an autopilot that is heard; None: none is."""
     return next((system for system in mavsdk.get_systems() if system.has_autopilot()), None)
 
 
@@ -421,7 +418,6 @@ def _send(
 def _next(
     source: FrameSource, seen: ReceivedFrame | None, stop: threading.Event
 ) -> ReceivedFrame | None:
-    """Return the next frame; None: somebody has asked to end."""
     newer_than = -1 if seen is None else seen.frame.sequence
     while not stop.is_set():
         found = source.wait(newer_than, WAIT_S)

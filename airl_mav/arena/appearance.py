@@ -61,7 +61,6 @@ class Finish:
     surface: NDArray[np.int8]  # (m,) number in SURFACES
     roughness: Floats  # (m,) `Material.roughness`
     images: tuple[ImageFile, ...] = ()
-    """Pictures that surfaces may have."""
 
     def colour(self, row: int) -> Rgb:
         """Return the sRGB 0-255 of a surface seen from far away: half of each albedo."""

@@ -151,7 +151,6 @@ def draw_things(rng: np.random.Generator, n: int, spec: ArenaSpec) -> Things:
 
 
 def _turned(name: str, asset: Asset, yaw: float, scale: float) -> _Thing:
-    """Return an asset of a heading [rad] and a scale."""
     parts = asset.parts
     shape = np.array([Shape[part.shape.upper()] for part in parts], np.int8)
     half_size = scale * np.array([part.half_size_m for part in parts])
@@ -167,7 +166,6 @@ def _turned(name: str, asset: Asset, yaw: float, scale: float) -> _Thing:
 
 
 def _joined(things: list[_Thing]) -> Things:
-    """Return things in their order."""
     parts = [thing.parts for thing in things]
     return Things(
         Bodies(

@@ -32,7 +32,6 @@ FLOOR_COLOUR = "#f8f7f4"
 GRID_COLOUR = "#e4e1da"
 TEXT_COLOUR = "#3a3f45"
 STATIC_COLOURS = ("#5b6670", "#2f363d")
-"""Face and edge."""
 MOVING_COLOURS = ("#f0932b", "#9c5a0c")
 OPENING, OPENING_COLOUR = "opening", "#cfe3f5"
 """What is below and above the opening of a gate, or a door: from above, the way leads through."""
@@ -125,7 +124,6 @@ def write_png(figure: Figure, path: Path, dpi: int = 150) -> None:
 
 
 def _draw_floor(arena: Arena, ax: Axes) -> None:
-    """Draw walls, floor and grid, and set up the axes."""
     b = arena.bounds
     length, width = b.north_max - b.north_min, b.east_max - b.east_min
     thick = WALL_SHARE * max(length, width)
@@ -153,7 +151,6 @@ def _draw_floor(arena: Arena, ax: Axes) -> None:
 
 
 def _draw_ground(ground: Ground, ax: Axes) -> None:
-    """Draw hills in tones between lines of equal height."""
     rows, columns = ground.heights.shape
     north = ground.south + ground.step_north * np.arange(rows)
     east = ground.west + ground.step_east * np.arange(columns)
@@ -217,7 +214,6 @@ def _holds(arena: Arena, radius: float, bearing_deg: int) -> bool:
 
 
 def _draw_obstacles(arena: Arena, ax: Axes, time_us: int) -> None:
-    """Draw all footprints; a ring inside marks a sphere, which is narrower above and below."""
     centers = arena.centers_at(time_us)
     labelled: set[bool | str] = set()
     open_way = np.zeros(len(arena.obstacles), np.bool_)
@@ -281,7 +277,6 @@ def _draw_arrow(ax: Axes, center: NDArray[np.float64], tour: Tour, time_us: int)
 
 
 def _draw_start_and_goal(arena: Arena, ax: Axes, goal_radius_m: float | None) -> None:
-    """Draw the start as a wedge that points north, the goal as a star in its disc."""
     north, east = arena.goal
     if goal_radius_m is not None:
         disc = Circle((east, north), goal_radius_m, edgecolor=GOAL_COLOUR, lw=1.0, zorder=1.5)

@@ -64,9 +64,7 @@ class _Request:
     ring_m: tuple[float, float]
     vehicle_width_m: float
     openings: Openings
-    """Of the gates."""
     plan: Plan | None
-    """Of the rooms."""
     ground: Ground | None
     """Where it rises above the floor; None: nowhere."""
 
@@ -197,7 +195,6 @@ def free_area_fraction(arena: Arena) -> float:
 
 
 def _rng(seed: int, stream: _Stream) -> np.random.Generator:
-    """Return the generator of one stream."""
     return seeded(seed, stream)
 
 
@@ -254,7 +251,6 @@ def _check_openings(openings: Openings, name: str, seed: int, vehicle_width_m: f
 
 
 def _draw_height(request: _Request, seed: int, goal: Floats) -> float | None:
-    """Return the height of the goal at a place (2,) above the floor [m]; None: it has none."""
     spec = request.spec
     if spec.goal.height_m is None:
         return None
@@ -386,7 +382,6 @@ def _around(center: Floats, clearance: float) -> Boxes:
 
 
 def _concatenate(static: Obstacles, moving: Obstacles) -> Obstacles:
-    """Return both, static ones first."""
     return Obstacles(
         *(
             np.concatenate([getattr(static, field), getattr(moving, field)])

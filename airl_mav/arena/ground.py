@@ -22,7 +22,6 @@ GRID_SIZE = 8
 """Numbers that say where a grid lies; see `Relief.grid`."""
 
 TOP, STEEPEST, ROWS, COLUMNS = 4, 5, 6, 7
-"""Places of some of them."""
 
 
 class Relief(NamedTuple):

@@ -22,7 +22,6 @@ from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.profiles.assets import MOST_PARTS, Asset, BoxPart
 
 Up = Literal["auto", "y", "z"]
-"""Which axis of the file points up."""
 
 Y_UP = (".glb", ".gltf")
 """Formats whose specification says that y points up."""
@@ -59,13 +58,11 @@ class MeshBoxes:
 
     asset: Asset
     cell_m: float
-    """Edge of the cells [m]."""
     size_m: tuple[float, float, float]
     """Of the mesh: forward, right, up [m]."""
     closed: bool
     """Whether it has an inside, which is filled."""
     surface: Triangles
-    """The mesh itself, in its place."""
 
     @property
     def beyond_m(self) -> float:
@@ -220,7 +217,6 @@ def _cells(
 
 
 def _box(low: NDArray[np.float64], high: NDArray[np.float64]) -> BoxPart:
-    """Return a box between two corners (3,) [m]; nothing is below the floor."""
     least, most = low.copy(), high.copy()
     least[2], most[2] = max(float(least[2]), 0.0), max(float(most[2]), LEAST_M)
     middle, size = 0.5 * (least + most), np.maximum(most - least, LEAST_M)

@@ -93,7 +93,6 @@ def least_gap_m(bounds: Bounds, width_m: float) -> float:
 
 
 def _cell_m(bounds: Bounds) -> float:
-    """Return the pitch of the raster of a floor [m]."""
     area = (bounds.north_max - bounds.north_min) * (bounds.east_max - bounds.east_min)
     return max(CELL_M, math.sqrt(area / CELLS_MAX))
 

@@ -55,7 +55,6 @@ class Door:
     """An opening in a wall, from the floor up."""
 
     wall: int
-    """Number of the wall that it is in."""
     rooms: tuple[int, int]
     """Numbers of the rooms that it joins."""
     low: float
@@ -299,7 +298,6 @@ def room_walls(plan: Plan, bounds: Bounds) -> tuple[Obstacles, Statics]:
 
 
 def _solid(parts: list[tuple[int, Rect, float]], top_m: float) -> Obstacles:
-    """Return boxes over parts of the floor, from their bottoms up to a height [m]."""
     boxes = _boxes([rect for _, rect, _ in parts])
     bottom = np.array([low for _, _, low in parts], np.float64)
     tall = 0.5 * (top_m - bottom)
@@ -331,13 +329,11 @@ def _hang(obstacles: Obstacles) -> NDArray[np.bool_]:
 
 
 def _boxes(rects: list[Rect]) -> Boxes:
-    """Return parts of the floor as boxes."""
     low = np.array([rect.low for rect in rects], np.float64).reshape(-1, 2)
     high = np.array([rect.high for rect in rects], np.float64).reshape(-1, 2)
     return Boxes(0.5 * (low + high), 0.5 * (high - low))
 
 
 def _any_overlap(boxes: Boxes, others: Boxes) -> bool:
-    """Return whether any of some boxes overlaps any of others."""
     apart: Floats = np.abs(boxes.center[:, None] - others.center)
     return bool((apart < boxes.half[:, None] + others.half).all(axis=2).any())

@@ -46,7 +46,6 @@ def _plain(schema: Mapping[str, Any], named: Mapping[str, Any]) -> dict[str, Any
 
 
 JSON = "json"
-"""Encoding of our own messages."""
 
 
 class Channel(NamedTuple):

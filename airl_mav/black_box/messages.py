@@ -20,7 +20,6 @@ from airl_mav.core.clock import NS_PER_US
 from airl_mav.core.constants import US_PER_S
 
 SUFFIX = ".mcap"
-"""Of the files."""
 
 Microseconds: TypeAlias = Annotated[int, Field(ge=-1, lt=2**62)]
 Whole: TypeAlias = Annotated[int, Field(ge=0, lt=2**62)]
@@ -194,7 +193,6 @@ class Log:
     level: int
     message: str
     name: str
-    """Who says it."""
     file: str = ""
     line: int = 0
 
@@ -232,10 +230,8 @@ SCHEMAS: dict[type[Message], str] = {
     RawImage: "foxglove.RawImage",
     Log: "foxglove.Log",
 }
-"""Names of the schemas."""
 
 INFO, WARNING = 2, 3
-"""Levels of foxglove.Log."""
 
 
 ENCODINGS: dict[str, tuple[str, int]] = {

@@ -270,7 +270,6 @@ def forest_of(files: tuple[MeshFile, ...], ground: Ground | None = None) -> Fore
 
 
 GROUND_FIRST: Final = GROUND - OBSTACLE
-"""`Meshes.first` of the ground."""
 
 GROUND_POSE: Final = (0.0, 0.0, 0.0, 1.0, 1.0, 0.0)
 """`Meshes.pose` of the ground: its first axis is east."""
@@ -291,7 +290,6 @@ class Meshes(NamedTuple):
     pose: NDArray[np.float64]
     """(k, 6) north, east [m], cosine and sine of its heading, scale, down [m]."""
     relief: Relief
-    """What is ground of them."""
 
 
 @borrowing_kernel

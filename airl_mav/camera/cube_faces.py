@@ -54,7 +54,6 @@ class Cube(NamedTuple):
     """Rows and columns of the image."""
     side: int
     faces: tuple[Face, ...]
-    """Those that are needed."""
 
 
 def side_for(camera: Intrinsics, samples: int) -> int:

@@ -49,7 +49,6 @@ class Intrinsics:
     projection: Projection = "pinhole"
     kind: CameraKind = "depth"
     distortion: Distortion = UNDISTORTED
-    """Coefficients of a fisheye."""
 
     @classmethod
     def from_fov(

@@ -34,7 +34,6 @@ class View(NamedTuple):
 
     focal: float
     line_centre: float
-    """Line of the optical axis."""
     pixel_centre: float
     """Pixel of the optical axis on that line."""
     s_min: float  # inverse of the range

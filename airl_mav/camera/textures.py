@@ -26,7 +26,6 @@ MODES: Final = ("1", "L", "P", "RGB")
 """Of Pillow: what has 8 bits a channel at most, and nothing that can be seen through."""
 
 LEAST_PX, MOST_PX = 2, 4096
-"""Of its sides [px]."""
 
 
 @lru_cache(maxsize=2 * MOST_IMAGES)

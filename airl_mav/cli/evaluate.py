@@ -108,7 +108,6 @@ def run(options: EvaluateOptions, console: Console | None = None) -> int:
 
 
 def _show(flown: FlownRun, gate: Gate, requirements: Sequence[Requirement], voice: Voice) -> int:
-    """Print the tables and write the report of one run; return the exit status."""
     code = EXIT_CODES[flown.ended]
     if not flown.episodes:
         voice.console.print(f"no episode was finished; {flown.path}", soft_wrap=True)

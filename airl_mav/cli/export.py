@@ -82,7 +82,6 @@ def run(options: ExportOptions, console: Console | None = None) -> int:
 
 
 def _export(options: ExportOptions) -> PolicyCard:
-    """Export a model in floats."""
     command = shlex.join(["airl", *sys.argv[1:]])
     options.facts(command)
     # Imported late: torch takes seconds, and a wrong option is found without it.
@@ -92,7 +91,6 @@ def _export(options: ExportOptions) -> PolicyCard:
 
 
 def _copy(options: ExportOptions) -> PolicyCard:
-    """Write a policy that is there, to be flown otherwise."""
     given = options.model_dump(exclude_defaults=True)
     changes = {name: given[name] for name in CHANGED if name in given}
     if other := sorted(given.keys() - {"model", "out", "name", *CHANGED}):

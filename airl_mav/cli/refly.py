@@ -155,7 +155,6 @@ def parts_table(parts: Sequence[PartFlown], flown_s: float) -> TableView:
 
 
 def _check(options: ReflyOptions) -> None:
-    """Raise FieldError for options that do not go together."""
     if options.parts and options.refit is None:
         raise FieldError("parts", options.parts, "with --refit")
     if options.workload is not None and options.computer is None:

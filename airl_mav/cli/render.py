@@ -221,7 +221,6 @@ def run(options: RenderOptions, console: Console | None = None) -> int:
 
 
 def _check(options: RenderOptions, filmed: bool) -> None:
-    """Raise FieldError for an option that does not go with the subject or another option."""
     for name in OF_AN_ARENA if filmed else OF_A_FLIGHT:
         value = getattr(options, name)
         if value != RenderOptions.model_fields[name].default:
@@ -274,7 +273,6 @@ def _is_truth(options: RenderOptions, out: Path) -> bool:
 
 
 def _camera(options: RenderOptions, size: tuple[int, int]) -> Intrinsics:
-    """Return the camera; its size where none is asked for."""
     width, height = options.width_px or size[0], options.height_px or size[1]
     return Intrinsics.from_fov(
         width,
@@ -297,7 +295,6 @@ def _drawn(options: RenderOptions, samples: int) -> Drawn:
 
 
 def _picture(options: RenderOptions, out: Path) -> str:
-    """Write the picture of an arena; return what was written."""
     spec = load_profile("arenas", options.subject, ArenaSpec)
     arena = generate(
         spec,
@@ -333,7 +330,6 @@ def _picture(options: RenderOptions, out: Path) -> str:
 
 
 def _film(options: RenderOptions, path: Path, out: Path, console: Console) -> str:
-    """Write the film of a flight; return what was written."""
     folder = folder_of(path)
     if options.trust:
         trust_arenas(load(folder))

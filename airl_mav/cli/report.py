@@ -94,7 +94,6 @@ def run(options: ReportOptions, console: Console | None = None) -> int:
 
 
 def _compare(options: ReportOptions, console: Console) -> int:
-    """Compare runs."""
     out = options.out or Path("runs") / f"{utc_now():%Y%m%dT%H%M%SZ}-compare"
     if (out / RUN_FILE).exists():
         raise FieldError("out", f"{out}", "another folder: it holds a run")

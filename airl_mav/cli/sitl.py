@@ -121,7 +121,6 @@ def conclude(flown: FlownRun, gate: Gate, requirements: Sequence[Requirement], v
 
 
 def _announce(scenario: ResolvedScenario, console: Console) -> None:
-    """Print what flies, and where to connect to it."""
     asked, setup = scenario.scenario, scenario.setup
     _say(console, f"airl-sitl  {asked.vehicle} in {asked.arena}, policy {scenario.policy.name}")
     if asked.level != "sitl":

@@ -127,4 +127,3 @@ ARDUPILOT = Autopilot(
 )
 
 AUTOPILOTS: Mapping[int, Autopilot] = {12: PX4, 3: ARDUPILOT}
-"""By HEARTBEAT.autopilot."""

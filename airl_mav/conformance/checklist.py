@@ -70,7 +70,6 @@ class Check(NamedTuple):
     name: str
     outcome: Outcome
     finding: str
-    """One line."""
     time_s: float
     """How long it took, by the transcript's clock [s]."""
 

@@ -16,7 +16,6 @@ from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.files import write_json
 
 SCHEMA = 1
-"""Version of the file."""
 
 
 @dataclass(frozen=True)
@@ -60,11 +59,8 @@ class ConformanceResult:
     reference: Reference | None = None
     """The stored column; None before the autopilot is known."""
     heartbeat: Fields | None = None
-    """The newest HEARTBEAT."""
     autopilot_version: Fields | None = None
-    """AUTOPILOT_VERSION."""
     interrupted: bool = False
-    """Whether Ctrl-C ended it."""
     known_to_be_down: bool = True
     """Whether the vehicle is known to be disarmed at the end."""
 

@@ -75,7 +75,6 @@ class Cell:
     name: str
     """Its run folder inside that of the campaign."""
     title: str
-    """One line for people."""
     scenario: ResolvedScenario
     label: str = ""
     """What it is called in the comparison; empty: the title. The next two as in its `RunEntry`."""

@@ -16,7 +16,6 @@ NATIVE = "native"
 """Stands for no injected latency."""
 
 LATENCIES = (NATIVE, "150ms", "300ms", "400ms", "950ms")
-"""The paper's steps."""
 
 FACTS = ("arena", "level", "vehicle", "episodes", "seed")
 

@@ -131,7 +131,6 @@ class Failure:
 
     message: str
     usage: bool
-    """Whether the input cannot be used."""
 
     def error(self, job: str) -> UsageError | WorkerError:
         """Return what is raised for a job of that name."""

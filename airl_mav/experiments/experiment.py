@@ -33,9 +33,7 @@ class Experiment:
 
     kind: Kind
     name: str
-    """Of a new folder, after the kind."""
     facts: dict[str, Any]
-    """What heads the comparison."""
     cells: tuple[Cell, ...]
     remarks: tuple[str, ...] = ()
     """What a person should know before it flies."""
@@ -111,13 +109,10 @@ class ExperimentResult:
     """What an experiment has come to, for Python."""
 
     path: Path
-    """Its folder."""
     runs: dict[str, Run]
-    """The run of each cell, by its name."""
     comparison: Comparison
     """Figures of every run, and the differences between them over pairs of flights."""
     page: Path
-    """The report."""
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows: what came out, the figures and the first picture."""

@@ -59,9 +59,7 @@ class FaultFlight:
     touchdown_m_s: float | None
     """Fastest contact with the floor; None: there was none."""
     farthest_m: float
-    """Greatest distance from home."""
     mode: str
-    """What was flown last."""
     said: tuple[str, ...]
     """Texts for the operator after the fault had begun."""
 
@@ -239,7 +237,6 @@ class _Flight:
 
 
 SCHEMA = 2
-"""Of `faults.json`."""
 
 ANY: frozenset[End] = frozenset({"not armed", "landed", "crashed"})
 """How a flight with a fault that is not in the catalogue may end."""

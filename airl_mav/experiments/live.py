@@ -38,14 +38,12 @@ class FlownRun:
     """What a run has come to."""
 
     path: Path
-    """Its folder."""
     ended: Ended
     episodes: tuple[EpisodeRecord, ...]
     """All that the folder holds, by index."""
     new: int
     """How many of them were flown now."""
     problem: str = ""
-    """Why it was broken off."""
 
 
 def fly_live(

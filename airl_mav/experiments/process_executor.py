@@ -120,11 +120,9 @@ class _Worker(Generic[executors.J]):
 
     process: BaseProcess
     job: executors.J
-    """What it does now."""
     attempt: int
     """Number of workers that this job has been given to."""
     compiles: bool = False
-    """Whether it compiles kernels now."""
 
 
 class _Pool(Generic[executors.J]):

@@ -48,7 +48,6 @@ class PartFlown:
     part: str
     rehearsals: int
     reached: int
-    """So many came to the goal."""
     time_s: float | None
     """Their median time [s]; None: none came."""
     time_share: float | None

@@ -50,7 +50,6 @@ class Changes:
     """What rehearsals of a flight have otherwise than the flight's own settings say."""
 
     vehicle: str | None = None
-    """Vehicle profile, by name or path."""
     wind: WindSettings | None = None
     """In the flight's own directions; None: calm."""
     latency: str | None = None
@@ -70,7 +69,6 @@ class Reflight:
     """What a flight did, and what its rehearsals did."""
 
     outcome: Outcome
-    """Of the flight."""
     flown_s: float
     """Its time from the start of navigation [s]."""
     rehearsals: int

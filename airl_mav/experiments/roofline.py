@@ -34,7 +34,6 @@ from airl_mav.scenario.aircraft import DEFAULT_VEHICLE, VehicleName
 from airl_mav.scenario.model import DEFAULT_POLICY, PilotSettings
 
 SCHEMA = 1
-"""Version of roofline.json."""
 
 RESULT_FILE = "roofline.json"
 

@@ -19,7 +19,6 @@ class Run:
     """A run folder, read. What is large is read when it is first asked for."""
 
     path: Path
-    """Its folder."""
 
     @cached_property
     def _loaded(self) -> LoadedRun:

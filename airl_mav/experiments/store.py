@@ -23,7 +23,6 @@ from airl_mav.rehearsal.lock import locked
 from airl_mav.rehearsal.run_folder import CAMPAIGN_FILE, another_config, check_folder
 
 SCHEMA = 1
-"""Version of `campaign.json`."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +30,6 @@ class DeclaredCell:
     """One evaluation, or one trial."""
 
     title: str
-    """One line for people."""
     settings: dict[str, Any] = field(default_factory=dict)
     """What is done; a cell with other settings is another one."""
     folder: str | None = None
@@ -49,7 +47,6 @@ class Declaration:
     kind: str
     """Which experiment: gap, ladder, sweep, ..."""
     settings: dict[str, Any]
-    """What all cells have in common."""
     cells: dict[str, DeclaredCell]
     """By name: that of the cell's folder."""
 

@@ -42,7 +42,6 @@ class SoughtVerdict:
     """None: it was interrupted or broken off."""
     comparison: Comparison | None = None
     runs: show.Runs | None = None
-    """Of the comparison, by name."""
     page: Path | None = None
 
 

@@ -124,10 +124,8 @@ class ComputerMeasurement:
 
     request: ProfileRequest
     card: PolicyCard
-    """Of the policy that was timed."""
     recording: Recording
     computer: str
-    """Name of the computer."""
     workload: str
     """Name of the workload in the profile."""
     profile: ComputerProfile

@@ -15,7 +15,6 @@ from airl_mav.scenario.model import GREATEST_SEED, Inference
 from airl_mav.scenario.stand_alone import CompanionAddresses
 
 NAME = r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$"
-"""Names that become names of files."""
 
 FLOWN_SPEED_M_S = 0.1
 """Speed limit in flight: far below what a goal or a wall could be reached with."""

@@ -43,7 +43,6 @@ class Soak:
 
     asked_s: float
     interrupted: bool
-    """It was ended early."""
     series: dict[str, NDArray[np.float64]]
     """A row for each second: `time_s` (its end, since the beginning), `n` decisions, their
     `p50_ms` and `max_ms`, `frequency_mhz`, `temperature_c`, `power_w`; NaN where not told."""

@@ -96,7 +96,6 @@ class Air:
     """What the air did."""
 
     drag_1_s: FittedQuantity
-    """Linear drag per mass."""
     wind_north_m_s: FittedQuantity
     wind_east_m_s: FittedQuantity
     quadratic_1_m: float

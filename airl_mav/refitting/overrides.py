@@ -30,7 +30,6 @@ class Override:
     key: str
     value: float
     remark: str
-    """What it was fitted from."""
 
 
 def overrides_of(

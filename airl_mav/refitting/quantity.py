@@ -34,7 +34,6 @@ class FittedQuantity:
     high: float | None = None
     """Ends of the 95 % interval."""
     source: str = ""
-    """What it was fitted from."""
     unobservable: str = ""
     """Why it is not known; "" where it is."""
     profile: float | None = None

@@ -29,10 +29,8 @@ from airl_mav.report.recorded_flight import stamps_of
 from airl_mav.vehicle_log.ulog import read_vehicle_log
 
 SCHEMA = 1
-"""Version of `refit.json`."""
 
 LOG_SUFFIX = ".ulg"
-"""Of a flight controller's log."""
 
 DEFAULT_COMPUTER = "workstation"
 """Stays on the ground: has no part in the vehicle's mass."""
@@ -50,9 +48,7 @@ class Refit:
     known: Known
     """Which of mass and thrust that profile was believed about."""
     vehicle: VehicleProfile
-    """It, as the flight says that it is."""
     overrides: tuple[Override, ...]
-    """Where the two differ."""
     response: ResponseFit
     thrust: Thrust
     air: Air

@@ -80,7 +80,6 @@ class _Driven:
     turned: Array
     """(n,) heading [rad], without jumps."""
     begun_m_s: tuple[float, float]
-    """Velocity at the first step."""
 
 
 @dataclass(frozen=True)

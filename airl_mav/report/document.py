@@ -26,7 +26,6 @@ REPORT_FILE = "report.html"
 SHEET_COLUMNS = 3
 
 Facts = tuple[tuple[str, str], ...]
-"""Terms with their texts."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +86,6 @@ class Document:
     """What that comes to, where it is a verdict: gives the box around it its colour."""
     headlines: tuple[Headline, ...] = ()
     facts: Facts = ()
-    """What was flown."""
     facts_title: str = "What flew"
     remarks: tuple[str, ...] = ()
     runs: tuple[RunLink, ...] = ()

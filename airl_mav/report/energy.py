@@ -137,7 +137,6 @@ def energy_flights_table(flights: Sequence[FlightEnergy], most: int) -> TableVie
 
 
 def _flight_row(flight: FlightEnergy) -> tuple[str, ...]:
-    """Return one flight's cells."""
     p = flight.parts
     parts = [NONE if p is None else f"{getattr(p, name) / 1e3:.2f}" for name in AIRFRAME]
     q = flight.quality

@@ -8,7 +8,6 @@ from airl_mav.rehearsal.run_folder import EPISODES_FILE, LoadedRun
 from airl_mav.report.table import OUTCOME_LABELS, Column, TableView
 
 MAX_LISTED = 60
-"""Lines of the table."""
 
 
 def faults_table(run: LoadedRun) -> TableView | None:

@@ -73,13 +73,11 @@ def flight_data(
 
 
 def _lines(of: Motion | EstimateErrors, keep: NDArray[np.int64]) -> dict[str, Steps]:
-    """Return each array of a dataclass by its name."""
     known = {name: values for name, values in vars(of).items() if values is not None}
     return {name: steps_of(values[keep], _unit(name)) for name, values in known.items()}
 
 
 def _outputs(motors: NDArray[np.float64]) -> list[Steps]:
-    """Return the outputs (n, 4) of the motors, one after the other."""
     return [steps_of(column, 0.002) for column in motors.T]
 
 

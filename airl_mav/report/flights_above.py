@@ -42,7 +42,6 @@ class Panel:
 
     title: str
     detail: str
-    """A second, smaller line."""
     episodes: Sequence[EpisodeRecord]
     paths: Mapping[int, Trajectory]
     """By episode index."""
@@ -89,7 +88,6 @@ def overview_picture(run: LoadedRun, arenas: Mapping[int, Arena]) -> theme.Pictu
 
 
 def _extent(panels: Sequence[Panel]) -> _Extent:
-    """Return the least part of the world that holds all walls, paths and goals."""
     low, high = np.zeros(2), np.zeros(2)
     for panel in panels:
         points = [np.array([flight.goal[:2] for flight in panel.episodes])]
@@ -148,7 +146,6 @@ def _draw_panel(
 
 
 def _draw_ground(ax: Axes, bounds: Bounds | None) -> None:
-    """Draw floor and start; the walls' place is known where all arenas share it."""
     if bounds is not None:
         b = bounds
         size = b.east_max - b.east_min, b.north_max - b.north_min
@@ -193,7 +190,6 @@ def _opacity(count: int) -> float:
 
 
 def _mark(ax: Axes, points: NDArray[np.float64], **look: Any) -> PathCollection:
-    """Draw markers at points (k, 2), east and north."""
     return ax.scatter(*points.T, edgecolors="white", linewidths=0.6, rasterized=True, **look)
 
 
@@ -206,7 +202,6 @@ def path_points(path: Trajectory, ended_us: int) -> NDArray[np.float64]:
 
 
 def _legend(episodes: Sequence[EpisodeRecord]) -> list[Line2D]:
-    """Return the legend: how many flights ended how."""
     handles = [
         Line2D([], [], ls="none", marker="^", ms=8, color=START_COLOUR, label="start"),
         Line2D([], [], ls="none", marker="*", ms=9, color=GOAL_COLOUR, label="goal"),

@@ -37,7 +37,6 @@ class Field:
     """One field of a heat map."""
 
     value: float
-    """What the colour shows."""
     text: str
     """What is written, at most two lines."""
     marked: bool = False

@@ -55,7 +55,6 @@ def _figures(headlines: list[Headline]) -> TableView:
 
 
 def _picture(run: LoadedRun) -> Picture:
-    """Draw the flights from above; of a single one, with its speed."""
     arenas = _arenas(run)
     if len(run.episodes) > 1:
         return overview_picture(run, arenas)
@@ -66,7 +65,6 @@ def _picture(run: LoadedRun) -> Picture:
 
 
 def _arenas(run: LoadedRun) -> dict[int, Arena]:
-    """Return the arenas of the worst flights; none where a profile is gone."""
     try:
         return arenas_of(pictured(run), vehicle_of(run.info))
     except UsageError:

@@ -213,7 +213,6 @@ def _arrived_us(
 
 
 def _use(resources: list[Resources]) -> ProcessUse | None:
-    """Return what the companion took of its computer."""
     if len(resources) < 2:
         return None
     times_s = np.array([each.time_us for each in resources]) / US_PER_S

@@ -21,7 +21,6 @@ BINDS: dict[Bound, str] = {
     "hold": "hold: the policy's action is held for the longest part",
     "link": "link: the way of the setpoint is the longest part",
 }
-"""What binds, in words."""
 
 RATES = 200
 """Points of a curve."""

@@ -149,7 +149,6 @@ def map_figure(
 
 
 def _draw_goal(ax: Axes, episode: EpisodeRecord) -> None:
-    """Draw start and goal where no arena does."""
     north, east = episode.goal[:2]
     colour = OUTCOME_COLOURS[Outcome.SUCCESS]
     ax.add_patch(
@@ -165,7 +164,6 @@ def _draw_goal(ax: Axes, episode: EpisodeRecord) -> None:
 def _draw_path(
     figure: Figure, ax: Axes, episode: EpisodeRecord, trajectory: Trajectory, top_speed: float
 ) -> None:
-    """Draw the path coloured by speed, its end marked by the outcome."""
     keep = np.unique(
         np.linspace(0, len(trajectory) - 1, min(len(trajectory), PATH_SEGMENTS)).astype(int)
     )

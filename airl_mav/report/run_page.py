@@ -163,7 +163,6 @@ def _kind(run: LoadedRun, summary: RunSummary) -> str:
 
 
 def _script() -> str:
-    """Return the page's own script."""
     folder = files("airl_mav.report") / "templates"
     return "\n".join((folder / name).read_text(encoding="utf-8") for name in SCRIPTS)
 

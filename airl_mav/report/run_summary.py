@@ -30,7 +30,6 @@ class RunSummary:
     """Everything that a report's tables say."""
 
     stages: dict[str, Summary]
-    """By stage key."""
     samples: dict[str, Samples]
     """Raw durations behind them [µs]."""
     quality: statistics.Aggregate

@@ -65,7 +65,6 @@ def computer_power(setup: Setup) -> str:
 
 
 def _part(part: Part) -> str:
-    """Return a part's name and description."""
     return f"{part.name} – {part.description}" if part.description else part.name
 
 
@@ -129,7 +128,6 @@ def episodes_table(run: LoadedRun, most: int | None = None) -> table.TableView:
 
 
 def _episode_row(episode: EpisodeRecord, *, computer: bool) -> tuple[str, ...]:
-    """Return an episode's cells, with the energy of its `computer` or without."""
     q = episode.quality
     figures = (
         (table.NONE,) * (6 + computer)
@@ -192,7 +190,6 @@ def quality_table(summary: RunSummary, *, computer: bool = True) -> table.TableV
 
 
 def _estimate_row(measure: Measure, mean: Estimate, median: Estimate) -> tuple[str, ...]:
-    """Return an estimate's cells."""
 
     def interval(of: Estimate) -> str:
         return (
@@ -227,7 +224,6 @@ def real_time_table(run: LoadedRun, summary: RunSummary) -> table.TableView:
 
 
 def _use_rows(uses: Sequence[ProcessUse]) -> list[tuple[str, ...]]:
-    """Return what the companion took of its machine as rows; none of a run recorded without."""
     if not uses:
         return []
     n, wall_s = f"{len(uses)}", sum(use.wall_s for use in uses)
@@ -250,7 +246,6 @@ def _use_rows(uses: Sequence[ProcessUse]) -> list[tuple[str, ...]]:
 
 
 def _tail_rows(title: str, summary: Summary) -> list[tuple[str, ...]]:
-    """Return median, p99 and maximum of a set of durations as rows; one row when there is none."""
     n = summary.n
     if not n:
         return [(title, table.NONE, "0")]

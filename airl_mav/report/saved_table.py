@@ -13,7 +13,6 @@ from airl_mav.core.files import read_typed, write_json
 from airl_mav.report.table import TableView
 
 SCHEMA = 1
-"""Version of the file."""
 
 TABLE_FILE = "table.json"
 
@@ -24,11 +23,9 @@ class SavedTable:
 
     title: str
     columns: tuple[str, ...]
-    """Titles with their units."""
     rows: tuple[tuple[str, ...], ...]
     notes: tuple[str, ...]
     policies: tuple[str, ...]
-    """Names of those that flew."""
     made: Mapping[str, Any]
     """With what (`core.provenance.provenance`)."""
 

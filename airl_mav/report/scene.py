@@ -44,15 +44,12 @@ MOST_TRIANGLES = 20_000
 """Of the meshes of one view: a page holds the views of many flights."""
 
 VIEW_M = 6.0
-"""Length of the drawn field of view."""
 
 ALL_ROUND_DEG = 360.0
-"""A field of view that has no edges."""
 
 STILL_COLOUR = "#8b97a3"
 
 HILLS_COLOURS = ("#e3dfd0", "#a8946a")
-"""Of low and of high ground."""
 
 MOST_CELLS = 4_000
 """Cells of hills on a page, for each flight."""
@@ -261,7 +258,6 @@ def body_mesh(obstacles: Obstacles, i: int, center: Floats) -> tuple[Floats, NDA
 
 
 def _arena_traces(arena: Arena, *, obstacles: bool = True) -> list[Trace]:
-    """Return floor, walls and the obstacles that stand still."""
     b = arena.bounds
     corners = [
         (b.east_min, b.north_min),
@@ -315,7 +311,6 @@ def _arena_traces(arena: Arena, *, obstacles: bool = True) -> list[Trace]:
 def _mesh(
     bodies: Sequence[tuple[Floats, NDArray[np.int64]]], colour: str, name: str, opacity: float = 1.0
 ) -> Trace:
-    """Return several bodies as one trace."""
     starts = np.cumsum([0, *(len(corners) for corners, _ in bodies)])
     corners = np.concatenate([corners for corners, _ in bodies])
     faces = np.concatenate(
@@ -334,7 +329,6 @@ def _mesh(
 
 
 def _line(points: Floats, colour: str, name: str, *, width: float) -> Trace:
-    """Return a line through points (n, 3)."""
     return {
         "type": "scatter3d",
         "mode": "lines",
@@ -347,7 +341,6 @@ def _line(points: Floats, colour: str, name: str, *, width: float) -> Trace:
 
 
 def _marks(points: Floats, colour: str, name: str, *, symbol: str) -> Trace:
-    """Return markers at points (n, 3)."""
     return {
         **_line(points, colour, name, width=1),
         "mode": "markers",
@@ -356,7 +349,6 @@ def _marks(points: Floats, colour: str, name: str, *, symbol: str) -> Trace:
 
 
 def _layout() -> dict[str, Any]:
-    """Return axes and cameras: from behind the start, from above, from the side."""
     eyes = {
         "From the start": (0.0, -1.75, 1.2),
         "From above": (0.0, -0.05, 2.6),
@@ -391,7 +383,6 @@ def _layout() -> dict[str, Any]:
 
 
 def _camera(eye: tuple[float, float, float]) -> dict[str, dict[str, float]]:
-    """Return a camera that looks at a place somewhat below the middle."""
     places = {"eye": eye, "center": (0.0, 0.0, -0.2)}
     return {name: dict(zip("xyz", place, strict=True)) for name, place in places.items()}
 
@@ -403,24 +394,20 @@ def _thinned(path: Trajectory, points: int) -> Trajectory:
 
 
 def _ring(east: float, north: float, radius: float) -> Floats:
-    """Return a level circle (n, 3) just above the floor."""
     turn = np.linspace(0.0, 2.0 * math.pi, 4 * CORNERS + 1)
     level = [east + radius * np.cos(turn), north + radius * np.sin(turn), np.full(len(turn), 0.05)]
     return np.stack(level, axis=1)
 
 
 def _east_north_up(points: Floats) -> Floats:
-    """Return points (n, 3) NED as east, north, up."""
     turned: Floats = points[:, [1, 0, 2]] * [1.0, 1.0, -1.0]
     return turned
 
 
 def _rounded(values: Floats) -> list[Any]:
-    """Return numbers to a hundredth, without -0."""
     rounded: list[Any] = (np.round(values, 2) + 0.0).tolist()
     return rounded
 
 
 def _hex(colour: tuple[float, float, float, float]) -> str:
-    """Return "#rrggbb"."""
     return "#" + "".join(f"{round(255.0 * channel):02x}" for channel in colour[:3])

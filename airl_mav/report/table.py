@@ -82,7 +82,6 @@ def percentile_cell(value_us: float | None, n: int) -> str:
 
 
 DURATION_COLUMNS = (Column("n"), *map(Column, ("mean", "p50", "p90", "p99", "max")))
-"""Columns of `duration_cells`."""
 
 
 def duration_cells(s: Summary) -> tuple[str, ...]:

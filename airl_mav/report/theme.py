@@ -25,15 +25,12 @@ from airl_mav.arena.draw import FLOOR_COLOUR, GOAL_COLOUR, GRID_COLOUR, START_CO
 INK = "#21262d"
 """Titles, labels, ticks."""
 MUTED = "#68707a"
-"""Secondary text."""
 RULE = "#d5d9de"
 """Grid and axis lines."""
 PAPER = "#fffffe"
 """Background; not quite white, so that white things keep their own."""
 SERIES = "#2868a8"
-"""Data."""
 SERIES_SOFT = "#a9c8e6"
-"""Data, filled areas."""
 MARK = "#b4540a"
 """What to look at: percentiles, phase limits."""
 
@@ -77,7 +74,6 @@ class Picture:
     """One figure in both forms."""
 
     name: str
-    """File name without suffix."""
     alt: str
     """What it shows, for those who do not see it."""
     svg: str

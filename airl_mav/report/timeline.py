@@ -155,7 +155,6 @@ def _draw_bands(rows: NDArray[np.object_], timeline: Timeline) -> int:
 
 
 def _draw_stage(ax: Axes, stage: Stage, durations: Samples) -> None:
-    """Draw one stage: a line through the decisions, or through the medians of columns of them."""
     there = np.flatnonzero(durations != NO_STAMP)
     found = durations[there]
     edges = np.linspace(0, len(durations), min(len(durations), COLUMNS) + 1).astype(int)
@@ -189,7 +188,6 @@ def _draw_stage(ax: Axes, stage: Stage, durations: Samples) -> None:
 
 
 def _mark_outliers(ax: Axes, there: NDArray[np.int64], found: Samples, limit: Fence | None) -> None:
-    """Mark the longest of the durations beyond the fence."""
     if limit is None:
         return
     beyond = np.flatnonzero(limit.marks(found))
@@ -200,7 +198,6 @@ def _mark_outliers(ax: Axes, there: NDArray[np.int64], found: Samples, limit: Fe
 
 
 def _outlier_text(limit: Fence) -> str:
-    """Say how many lie beyond the fence."""
     where = f"above {ms(limit.limit_us)} ms"
     if limit.second_kind:
         return f"{limit.beyond / limit.n:.0%} {where}: a second kind, not marked"
@@ -271,7 +268,6 @@ def slowest_table(
 def _slow_row(
     timeline: Timeline, decision: int, median_us: float, parts: Sequence[Stage]
 ) -> tuple[str, ...]:
-    """Return the cells of one decision."""
     whole = int(timeline.stages["end_to_end"][decision])
     spent: Mapping[str, int] = {
         stage.title: int(timeline.stages[stage.key][decision]) for stage in parts

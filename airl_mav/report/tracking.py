@@ -141,7 +141,6 @@ def track(run: LoadedRun, record: EpisodeRecord) -> TrackedFlight | None:
 
 
 def _motors(stamps: Arrays, time_us: NDArray[np.int64]) -> Floats | None:
-    """Return the motor outputs (m, 4) at times (m,); zero before and after they are known."""
     times, outputs = stamps.get(MOTOR_TIMES), stamps.get(MOTOR_OUTPUTS)
     if times is None or outputs is None or len(times) < 2:
         return None
@@ -167,7 +166,6 @@ def commands_of(stamps: Arrays, zero_us: int) -> Commands:
 def _motion(
     time_us: NDArray[np.int64], position: Floats, velocity: Floats, quaternion: Floats
 ) -> tuple[Motion, Floats]:
-    """Return motion and heading (m,) [rad], the latter without jumps."""
     roll, pitch, yaw = quats_to_euler(quaternion)
     heading: Floats = np.unwrap(yaw)
     level = ned_to_heading(velocity, heading)

@@ -29,7 +29,6 @@ BEFORE_S = 2.0
 """So much of the take-off is shown [s]; all of it where it was not finished."""
 
 IMAGES = 5
-"""Depth images above the rows."""
 
 ALWAYS = ("forward_m_s", "right_m_s")
 """Rows that every flight has, whatever it is commanded."""
@@ -102,7 +101,6 @@ def tracking_figure(
 
 
 def _rows(flight: TrackedFlight) -> list[tuple[str, list[_Line]]]:
-    """Return the rows, from the top: label and lines."""
     flown, estimated, errors, t = flight.flown, flight.estimated, flight.errors, flight.time_s
     rows = []
     for name in dict.fromkeys((*ALWAYS, *flight.commands.values)):
@@ -197,7 +195,6 @@ def _draw_image(figure: Figure, place: int, image: NDArray[np.uint8], title: str
 
 
 def _legend(flight: TrackedFlight) -> list[Line2D]:
-    """Return what the colours mean."""
     kinds = [("commanded", COMMANDED, "-"), ("flown", FLOWN, "-")]
     if flight.estimated is not None:
         kinds.append(("estimated", ESTIMATED, "--"))

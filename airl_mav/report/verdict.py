@@ -161,7 +161,6 @@ def unchecked(runs: Iterable[RunInfo]) -> tuple[str, ...]:
 
 
 def _gap_words(against: PairedComparison, reference: str) -> str:
-    """Return how a run differs from its reference."""
     rate, time = against.success_rate.difference, against.flight_time_s.difference
     told = []
     if rate.value is not None:

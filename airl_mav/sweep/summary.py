@@ -34,7 +34,6 @@ class NetworkSummary:
     """One network in one arena, over its training seeds."""
 
     arena: str
-    """Name of the arena."""
     layers: int
     filters: int
     parameters: int
@@ -73,7 +72,6 @@ class Sweep:
     made: dict[str, Any]
     computer: Computer | None
     cells: tuple[NetworkSummary, ...]
-    """By arena, layers, filters."""
 
     @property
     def config(self) -> SweepConfig:

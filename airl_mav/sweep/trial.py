@@ -96,7 +96,6 @@ class Trained:
     """How the training went."""
 
     steps: int
-    """Decisions after which it ended."""
     best_steps: int
     """Decisions after which the weights were best; those fly."""
     selection_success: float
@@ -116,7 +115,6 @@ class TrialResult:
     episodes: int
     successes: int
     outcomes: dict[Outcome, int]
-    """Flights by how they ended."""
     flight_time_s: float | None
     """None: no flight reached the goal."""
     distance_m: float | None

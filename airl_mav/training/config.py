@@ -34,7 +34,6 @@ def kind_of(actions: str) -> ActionKind:
 ACTION_SETS = {
     kind: [name for name in SHIPPED if kind_of(name) == kind] for kind in get_args(ActionKind)
 }
-"""The action sets of each kind."""
 
 
 class NetworkSpec(ProfileModel):

@@ -30,7 +30,6 @@ from airl_mav.policy.observation_spec import Encoded
 from airl_mav.training.config import Precision
 
 RUNNING, TERMINATED, TRUNCATED = 0, 1, 2
-"""Status of an episode after a step."""
 
 NOT_ASIDE = -1
 

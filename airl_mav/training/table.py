@@ -18,7 +18,6 @@ from airl_mav.core.fields import ProfileModel, quantity
 ActionKind = Literal["discrete", "continuous"]
 
 Declared = tuple[Any, Any]
-"""Type and field of an option."""
 
 
 def _number(kind: Any, meaning: str, **bounds: Any) -> Declared:
@@ -153,11 +152,9 @@ class Algorithm:
     """What sets an algorithm apart."""
 
     source: str
-    """Its class."""
     fields: Mapping[str, str]
     """Fields of `[algorithm]` that it has, and the names of its arguments for them."""
     options: type[ProfileModel]
-    """Its hyperparameters."""
     actions: ActionKind | None = None
     """The only kind of action set that it can choose from; None: both."""
     to_policy: tuple[str, ...] = ()

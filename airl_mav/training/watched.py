@@ -47,7 +47,6 @@ LOOK_S = 0.1
 """So often it is looked for a flight to show [wall s]."""
 
 INFO = 6
-"""MAV_SEVERITY_INFO."""
 
 
 def request_of(name: str, port: int | None = None) -> Request:

@@ -68,7 +68,6 @@ class Alignment:
     accepted_range_us: tuple[float, float] | None
     """The bounds of it that the most setpoints agree on [µs]."""
     setpoints: int
-    """So many agree on it."""
 
     @property
     def round_trip_us(self) -> float | None:

@@ -20,7 +20,6 @@ Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
 
 MOTORS = 4
-"""Vehicles here have four."""
 
 _TOPICS = (
     "actuator_motors",
@@ -182,14 +181,12 @@ def _battery(topics: Mapping[str, Any]) -> Series:
 
 
 def _setpoint(topics: Mapping[str, Any]) -> Series:
-    """Return what was tracked, from the topic that has more samples of it."""
     local = _series(topics, "vehicle_local_position_setpoint", ("vx", "vy", "vz", "yawspeed"))
     trajectory = _series(topics, "trajectory_setpoint", (*_numbered("velocity", 3), "yawspeed"))
     return max(local, trajectory, key=len)
 
 
 def _series(topics: Mapping[str, Any], topic: str, fields: Sequence[str]) -> Series:
-    """Return fields of a topic; empty where it, or one of them, was not logged."""
     data = topics.get(topic)
     if data is None or any(name not in data for name in fields):
         return empty(len(fields))

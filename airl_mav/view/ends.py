@@ -21,7 +21,6 @@ class ViewEnds(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     told: str
-    """Where snapshots go."""
     asked: str
     """Where it says what its watchers ask for."""
 
@@ -32,7 +31,6 @@ class Request(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     run: str
-    """What the run is called."""
     port: int | None
     """TCP port of the page; None: any free one."""
     paced: bool
@@ -43,7 +41,6 @@ class Request(BaseModel):
     compensable: bool
     """Whether it can be compensated: the vehicle's response is known."""
     compensated: bool
-    """Whether it is."""
 
 
 class Answer(BaseModel):
@@ -52,6 +49,5 @@ class Answer(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     port: int = 0
-    """TCP port of the page."""
     ends: ViewEnds | None = None
     """None: the port is taken."""

@@ -28,7 +28,6 @@ ARROW_S = 0.6
 """A velocity's arrow ends where the vehicle would be after so long [s]."""
 
 LEAST_ARROW_M = 0.02
-"""A shorter one is not drawn."""
 
 
 @dataclass(frozen=True)

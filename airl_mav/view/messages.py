@@ -54,7 +54,6 @@ class VehicleShape(Message):
     camera_fov_deg: float
     """Horizontal."""
     camera_aspect: float
-    """Width over height."""
     camera_range_m: float
 
     @classmethod
@@ -112,7 +111,6 @@ class Vehicle(Message):
     """Empty: not known."""
     armed: bool
     collision: str | None
-    """What has been hit."""
 
 
 class Picture(Message):
@@ -129,7 +127,6 @@ class Decided(Message):
 
     kind: Literal["decided"] = "decided"
     captured_us: int
-    """Exposure of the frame."""
     began_us: int
     ready_us: int
     sent_us: int
@@ -178,9 +175,7 @@ class Trained(Message):
     kind: Literal["trained"] = "trained"
     time_us: int
     action: str
-    """What was chosen of the action set."""
     reward: float
-    """Of the decision."""
     returned: float
     """Sum of the episode's rewards so far."""
     steps: int = 0
@@ -241,5 +236,4 @@ def shape_of(image: Image) -> Shape:
 
 
 def _number(shape: tuple[int, ...]) -> str:
-    """Return the type of an image's numbers."""
     return "<u2" if len(shape) == 2 else "u1"

@@ -45,7 +45,6 @@ LEAST_PX = 192
 """Images are shown at least so wide, each pixel as a square."""
 
 WARNING = 4
-"""MAV_SEVERITY_WARNING."""
 
 NOTHING = "–"
 

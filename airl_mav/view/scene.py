@@ -141,7 +141,6 @@ class FlightScene:
     # --- once an episode
 
     def _surround(self, episode: Episode, arena: Arena | None) -> None:
-        """Build what stands around the flight."""
         if self._look.whole:
             bounds = OPEN if arena is None else arena.bounds
             self._build_floor(bounds)
@@ -150,7 +149,6 @@ class FlightScene:
                 self._build_arena(arena)
 
     def _build(self, episode: Episode) -> None:
-        """Build what flies."""
         self._build_vehicle(episode.vehicle)
         none = np.zeros((0, 2, 3), np.float32)
         # At the vehicle's place, by a message of the same kind: they move with it, not behind it.
@@ -224,7 +222,6 @@ class FlightScene:
                 self._movers.append(node)
 
     def _build_ends(self, episode: Episode, height: float, base: float) -> None:
-        """Build start and goal, with a pole of a height [m] on ground of a height [m]."""
         goal = episode.goal[:2]
         if (height_m := goal_height_m(episode.goal)) is not None:
             height = height_m - base
@@ -280,7 +277,6 @@ class FlightScene:
         return self._add("cylinder", name, radius=half[0], height=2.0 * half[2], **look)
 
     def _build_vehicle(self, shape: VehicleShape) -> None:
-        """Build the vehicle of its parts: a body, two arms, a nose, four rotors, a camera."""
         self._vehicle = self._add("frame", "/vehicle", show_axes=False)
         forward, right, radius = shape.arm_forward_m, shape.arm_right_m, shape.rotor_radius_m
         height = max(0.04, 0.5 * shape.height_m)

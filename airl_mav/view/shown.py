@@ -46,7 +46,6 @@ class Shown:
     trail: list[Point] = field(default_factory=list)
     """Where the vehicle was in this episode, NED [m]."""
     picture: messages.Image | None = None
-    """The camera's newest image."""
     decided: messages.Decided | None = None
     decided_image: messages.Image | None = None
     """What the policy saw at that decision."""

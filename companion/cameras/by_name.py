@@ -22,7 +22,6 @@ EXTRAS = {
     ROS2: "Cyclone DDS and rosbags (pip install 'airl-mav[ros2]')",
     ROSBAG: "rosbags (pip install 'airl-mav[ros2]')",
 }
-"""What they need."""
 
 
 class OpenCamera(FrameSource, Protocol):

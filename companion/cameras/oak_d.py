@@ -101,7 +101,6 @@ class OakD:
             self._pipeline.wait()
 
     def _taken(self, timeout_s: float) -> Any | None:
-        """Wait for the next frame; None: there is none in time."""
         try:
             return self._queue.get(timedelta(seconds=timeout_s))
         except dai.MessageQueue.QueueException:

@@ -177,7 +177,6 @@ class Ros2Camera:
 
 
 def _next(reader: DataReader[Any], timeout_s: float) -> Any | None:
-    """Wait for the next sample; None: there is none in time."""
     try:
         return reader.take_one(timeout=duration(microseconds=round(timeout_s * 1e6)))
     except StopIteration:

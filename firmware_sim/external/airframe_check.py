@@ -22,7 +22,6 @@ _PX4_MOTOR_1 = 101
 """PX4's output function of motor 1 (docs: Actuator Configuration)."""
 
 _PX4_MULTIROTOR = 0
-"""PX4's CA_AIRFRAME."""
 
 _ARDUPILOT_MOTOR_1 = 33
 """ArduPilot's SERVOn_FUNCTION of motor 1."""
@@ -48,7 +47,6 @@ class Airframe:
     also_read: tuple[str, ...] = ()
     """Further parameters that must be known."""
     autostart: int = 0
-    """PX4's SYS_AUTOSTART."""
 
     def names(self) -> list[str]:
         """Return the names of all parameters that must be known."""

@@ -223,6 +223,5 @@ class ExternalFlightStack:
 
 
 def _some(items: Sequence[str]) -> str:
-    """Return the first few items for a message, and how many more there are."""
     more = f" and {len(items) - SHOWN} more" if len(items) > SHOWN else ""
     return ", ".join(items[:SHOWN]) + more

@@ -75,7 +75,6 @@ WITHOUT_GPS: Mapping[str, int] = {
     **{name: us for name, us in INTERVALS_US.items() if name != "GPS_RAW_INT"},
     "ESTIMATOR_STATUS": 500_000,
 }
-"""The same of a vehicle without GPS."""
 
 ASK_EVERY_US = 1_000_000
 """Interval at which messages that have not arrived are requested again [µs]."""
@@ -292,4 +291,3 @@ class Observer:
 
 
 TEXT_LENGTH = 50
-"""Characters of one STATUSTEXT."""

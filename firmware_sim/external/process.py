@@ -126,7 +126,6 @@ class StartCommand:
     """How a program is started in a folder of its own."""
 
     argv: Sequence[str]
-    """Program and arguments."""
     environment: Mapping[str, str]
     """Added to our own environment."""
 

@@ -12,7 +12,6 @@ from firmware_sim.autopilot.port import LogEntry, OpenLog
 from firmware_sim.flight_log.flight_log import FlightLog
 
 ULOG_SUFFIX = ".ulg"
-"""Of a vehicle's own log."""
 
 OPEN_FILES = 8
 """Logs that are kept open for those who download them, in every tick a little."""

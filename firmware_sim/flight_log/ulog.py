@@ -39,7 +39,6 @@ _CODES = {
     "double": "d",
     "bool": "?",
 }
-"""ULog's types as `struct` has them."""
 
 
 @dataclass(frozen=True)

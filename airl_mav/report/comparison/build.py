@@ -118,7 +118,6 @@ def _marks(entries: Sequence[model.RunEntry]) -> dict[str, str]:
 
 
 def _compared_run(entry: model.RunEntry, mark: str, run: LoadedRun) -> model.ComparedRun:
-    """Work out one run."""
     tests = tests_of(run)
     samples = samples_of(run)
     planned = len(run.info.seeds) if entry.planned is None else entry.planned
@@ -143,7 +142,6 @@ def _contrast(
     runs: Mapping[str, LoadedRun],
     figures: Mapping[str, model.ComparedRun],
 ) -> model.Contrast:
-    """Compare a run with its reference on the episodes that both flew."""
     reference, target = runs[entry.reference], runs[entry.target]
     flown = {episode.seed: _task(episode) for episode in reference.episodes}
     known = [episode for episode in target.episodes if episode.seed in flown]
@@ -167,7 +165,6 @@ def _task(episode: EpisodeRecord) -> tuple[str, int, Goal]:
 
 
 def _facts(run: LoadedRun) -> dict[str, str]:
-    """Return what was flown on what, by term: the setup, then the settings."""
     facts = dict(setup_rows(run))
     facts["flights"] = f"{len(tests_of(run)):,}"
     seeds = [episode.seed for episode in run.episodes]
@@ -206,7 +203,6 @@ def _hold(config: Mapping[str, Any]) -> float | None:
 def _navigation_start(
     run: LoadedRun, tests: Sequence[EpisodeRecord]
 ) -> model.NavigationStart | None:
-    """Return where navigation begins."""
     rows = []
     energies: list[float] = []
     for episode in tests:
@@ -228,7 +224,6 @@ def _navigation_start(
 
 
 def _position_error(run: LoadedRun, tests: Sequence[EpisodeRecord]) -> float | None:
-    """Return the mean over flights of the mean error of the estimated position [m]."""
     errors = []
     for episode in tests:
         path = run.trajectories.get(episode.index)

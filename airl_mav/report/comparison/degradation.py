@@ -127,7 +127,6 @@ def _verdict(comparison: Comparison, policy: str) -> list[str]:
 
 
 def _success_trend(steps: Sequence[Contrast]) -> str:
-    """Return whether the success rate rises at any step."""
     rises = [(step.entry.title, step.paired.success_rate.difference) for step in steps]
     if sure := [title for title, d in rises if d.low is not None and d.low > 0.0]:
         return f"not monotone, it rises at {', '.join(sure)}"
@@ -137,7 +136,6 @@ def _success_trend(steps: Sequence[Contrast]) -> str:
 
 
 def _monotone(measure: Measure, steps: Sequence[Contrast]) -> str:
-    """Return whether a measure grows with every step."""
     changes = [(step.entry.title, measure.change(step.paired).difference) for step in steps]
     known = [(title, d) for title, d in changes if d.value is not None and d.n >= FEWEST]
     if not known:

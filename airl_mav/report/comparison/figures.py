@@ -27,7 +27,6 @@ from airl_mav.report.run_figures import LONG_TAIL, OUTCOME_MARKERS
 from airl_mav.report.table import NONE, OUTCOME_LABELS
 
 ROW_IN = 0.5
-"""Height of a contrast in a figure."""
 
 CDF_STAGES = ("t2", "end_to_end")
 """Stages whose distributions are drawn over each other."""
@@ -240,7 +239,6 @@ def seed_pictures(
 def _seed_picture(
     name: str, compared: Sequence[ComparedRun], runs: Runs, seed: int
 ) -> theme.Picture:
-    """Draw the flights of one seed over their arena, as it was when they began."""
     figure = theme.new_figure(4.2, 4.6)
     ax: Axes = figure.subplots()
     flights = [

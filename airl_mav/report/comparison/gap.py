@@ -75,7 +75,6 @@ def gap_sentence(comparison: Comparison, arena: str) -> str:
 
 
 def _computer(run: ComparedRun) -> str:
-    """Return a run's computer with its latency."""
     name, mean = Path(run.setup.computer.name).stem, run.stages["t2"].mean
     if mean is None:
         return name
@@ -105,7 +104,6 @@ OVERLAID = 100
 """Flights of a run that are drawn over each other: the first seeds."""
 
 WORST_ROLES = ("reference", "target", "mitigated")
-"""What is drawn of the worst seeds."""
 
 COST, HELP = "cost-on-reference", "mitigation-on-target"
 
@@ -329,7 +327,6 @@ def document_of(comparison: Comparison, runs: Mapping[str, LoadedRun], folder: P
 def _arena_sections(
     comparison: Comparison, runs: Mapping[str, LoadedRun], arena: str
 ) -> list[Section]:
-    """Return what is said of one arena."""
     name = Path(arena).stem
     flown, contrasts = comparison.group(arena), comparison.contrasts_of(arena)
     legend = tuple(

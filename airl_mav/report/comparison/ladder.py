@@ -162,7 +162,6 @@ def _pace_sentence(comparison: Comparison, contrast: Contrast) -> str:
 
 
 def _widest_sentence(comparison: Comparison, contrast: Contrast) -> str:
-    """Return whether a few seeds make a difference, or all of them."""
     widest = comparison.extra["widest_percent"][contrast.entry.target]
     if widest is None:
         return ""

@@ -46,7 +46,6 @@ def matrix_tables(runs: Sequence[ComparedRun]) -> list[TableView]:
 
 
 def _cell(run: ComparedRun | None, measure: Measure) -> str:
-    """Return a figure with its interval; a star where the policy was trained."""
     if run is None:
         return NONE
     text = measure.with_interval(run.quality)
@@ -59,7 +58,6 @@ def trained_here(run: ComparedRun) -> bool:
 
 
 def _notes(runs: Sequence[ComparedRun], measure: Measure) -> tuple[str, ...]:
-    """Return what the figures mean."""
     if measure is not SUCCESS_RATE:
         return ("Means over the flights that reached the goal, 95 % bootstrap intervals.",)
     notes = ["Of all flights; 95 % intervals after Wilson. The same seeds in every cell."]

@@ -59,7 +59,6 @@ class ContrastEntry:
     title: str = ""
     """One line that names the reference."""
     short: str = ""
-    """The same in few words."""
 
 
 def part_of(entry: RunEntry) -> str:
@@ -72,7 +71,6 @@ class NavigationStart:
     """Where navigation begins: means over the flights in which it did."""
 
     n: int
-    """Number of those flights."""
     takeoff_s: float
     """Time from the reset to the start of navigation [s]; 0: the level begins in a hover."""
     takeoff_distance_m: float
@@ -93,7 +91,6 @@ class ComparedRun:
     """Stands for the run where there is little room: its part in the comparison (`target`), a short
     name, or a letter."""
     setup: Setup
-    """What was flown on what."""
     planned: int
     flown: int
     facts: dict[str, str]

@@ -131,7 +131,6 @@ def _checked(names: Sequence[str], runs: Sequence[LoadedRun]) -> list[str]:
 
 
 def _names(runs: Sequence[LoadedRun]) -> list[str]:
-    """Name runs by what tells them apart; by their folders where that does not do it."""
     rows = [_traits(run) for run in runs]
     telling = [key for key in rows[0] if len({row[key] for row in rows}) > 1]
     names = [", ".join(row[key] for key in telling if row[key]) for row in rows]
@@ -142,7 +141,6 @@ def _names(runs: Sequence[LoadedRun]) -> list[str]:
 
 
 def _traits(run: LoadedRun) -> dict[str, str]:
-    """Return what might tell a run apart, by kind."""
     setup, config = run.info.setup, run.info.config
     parts = {kind: getattr(setup, kind) for kind in NAMING}
     traits = {

@@ -118,7 +118,6 @@ def judge_comparison(
 
 
 def _judged(comparison: model.Comparison) -> tuple[model.ComparedRun, ...]:
-    """Return the runs that have to meet what is required."""
     if comparison.kind != "gap":
         return comparison.runs
     judged = []

@@ -216,7 +216,6 @@ def contrast_table(
 def _contrast_row(
     contrast: Contrast, measure: Measure, reference: ComparedRun, target: ComparedRun
 ) -> tuple[str, ...]:
-    """Return the cells of one measure."""
     change = measure.change(contrast.paired)
     d = change.difference
     unit = measure.difference_unit

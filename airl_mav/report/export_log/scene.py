@@ -49,10 +49,8 @@ WORLD, VEHICLE, ESTIMATE, CAMERA = "world", "vehicle", "estimate", "camera"
 depth camera, an optical frame (x right, y down, z forward)."""
 
 UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])
-"""No rotation."""
 
 PROTOBUF = "protobuf"
-"""Encoding of the messages."""
 
 
 _CHANNELS: dict[tuple[str, Any], Channel] = {}
@@ -241,14 +239,12 @@ def obstacle(
 
 
 def _mesh(placed: PlacedMesh, at: messages.Timestamp) -> messages.SceneEntity:
-    """Return a mesh where it stands."""
     return _surface(f"mesh/{placed.first}", *standing(placed), STILL, at)
 
 
 def _surface(
     name: str, places: Floats, faces: NDArray[np.int32], rgb: Colour, at: messages.Timestamp
 ) -> messages.SceneEntity:
-    """Return triangles (m, 3) of places (n, 3) NED [m]."""
     surface = messages.TriangleListPrimitive(
         pose=messages.Pose(position=vector(np.zeros(3)), orientation=quaternion(UNTURNED)),
         points=points(places),
@@ -324,7 +320,6 @@ def _cylinder(
 
 
 def _block(center: Floats, size: Size, rgb: Colour, opacity: float = 1.0) -> messages.CubePrimitive:
-    """Return a block, north by east by height [m], at a place NED."""
     x, y, z = size
     return messages.CubePrimitive(
         pose=pose(center), size=messages.Vector3(x=x, y=y, z=z), color=colour(rgb, opacity)
@@ -347,7 +342,6 @@ def _part(frd: Size, size: Size, rgb: Colour, opacity: float) -> messages.CubePr
 
 
 def _arm(rotor: Floats, rgb: Colour, opacity: float) -> messages.CubePrimitive:
-    """Return what carries a rotor, from the middle to its place FRD [m]."""
     forward, right, _ = rotor.tolist()
     half = np.array([0.5 * forward, 0.5 * right, 0.0])
     return messages.CubePrimitive(

@@ -69,7 +69,6 @@ SAMPLES_A_STATUS = 25
 """Rows of the path for one message about the battery: 2 Hz, as in a black box."""
 
 REFEREE = "referee"
-"""Who says how a flight ended."""
 
 IMAGES: dict[CameraKind, tuple[str, str]] = {
     "depth": ("16UC1", "/camera/depth"),
@@ -83,7 +82,6 @@ class Told(NamedTuple):
     """A message, ready to be written or sent."""
 
     time_us: int
-    """Simulated time [µs]."""
     channel: Channel
     data: bytes
 
@@ -126,7 +124,6 @@ class FlightMessages:
     # --- what is seen in three dimensions
 
     def _still(self) -> Iterator[Told]:
-        """Give what does not change."""
         record, time_us = self._record, int(self._path.time_us[0])
         at = timestamp(self._unix_us(time_us))
         arena = arena_scene(self._replayed.arena, record.goal, record.goal_radius_m, at)
@@ -144,7 +141,6 @@ class FlightMessages:
         return vehicle_scene(self._shape, frame, look, timestamp(self._unix_us(time_us)))
 
     def _moving(self) -> Iterator[Told]:
-        """Give the poses of the vehicle and of its estimate, velocities and moving obstacles."""
         path, estimate = self._path, self.flight.estimate
         parts = [self._poses(path, "/tf", VEHICLE), self._scene(path)]
         if estimate is not None:
@@ -210,7 +206,6 @@ class FlightMessages:
         )
 
     def _seen(self) -> Iterator[Told]:
-        """Give the image that each decision saw, at its exposure."""
         columns = self.flight.decisions
         for time_us in np.unique(columns.get("capture_us", np.zeros(0, np.int64))).tolist():
             seen = None if time_us == NO_STAMP else self._replayed.image(time_us)
@@ -312,7 +307,6 @@ class FlightMessages:
 
 
 def _rows(path: Trajectory) -> Iterator[tuple[int, Any, Any, Any]]:
-    """Give time, position, velocity and quaternion of each row, as plain numbers."""
     states = (path.position.tolist(), path.velocity.tolist(), path.quaternion.tolist())
     for time_us, position, velocity, quat in zip(path.time_us.tolist(), *states, strict=True):
         yield time_us, tuple(position), tuple(velocity), tuple(quat)
@@ -321,6 +315,5 @@ def _rows(path: Trajectory) -> Iterator[tuple[int, Any, Any, Any]]:
 def _of_row(
     i: int, rows: NDArray[np.int64], values: NDArray[np.int64], *, scale: float
 ) -> float | None:
-    """Return the value of row i of those that have one; None: it has none."""
     at = int(np.searchsorted(rows, i))
     return float(values[at]) * scale if at < len(rows) and rows[at] == i else None

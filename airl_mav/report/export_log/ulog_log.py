@@ -58,7 +58,6 @@ EXPORTED = (*(_LOGGED[name].topic for name in NAMES), TRAJECTORY_SETPOINT)
 _NUMBER = {topic.name: i for i, topic in enumerate(EXPORTED)}
 
 Sample = tuple[int, str, Values]
-"""Time [µs], topic, values."""
 
 
 def write_ulog(flight: RecordedFlight, path: Path) -> None:
@@ -156,7 +155,6 @@ def _motion(path: Trajectory, suffix: str) -> Iterator[Sample]:
 
 
 def _setpoints(flight: RecordedFlight) -> Iterator[Sample]:
-    """Give what the companion commands, while the policy flies."""
     columns = flight.decisions
     if len(columns.get(SETPOINT, ())):
         yield from _velocity_setpoints(flight, columns)
@@ -177,7 +175,6 @@ def _setpoints(flight: RecordedFlight) -> Iterator[Sample]:
 def _velocity_setpoints(
     flight: RecordedFlight, columns: Mapping[str, NDArray[Any]]
 ) -> Iterator[Sample]:
-    """Give the commanded velocity, NED, and yaw rate."""
     path = flight.replayed.path
     velocities = commanded_velocity(path, columns, path.time_us)
     tracked = "vehicle_local_position_setpoint"
@@ -246,7 +243,6 @@ def _states(flight: RecordedFlight, path: Trajectory) -> Iterator[Sample]:
 
 
 def _texts(flight: RecordedFlight) -> Iterator[tuple[int, int, str]]:
-    """Give texts: time [µs], severity, words."""
     record = flight.replayed.record
     for note in (*record.notes, *record.invalid):
         yield int(flight.replayed.path.time_us[0]), WARNING, note

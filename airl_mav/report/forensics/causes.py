@@ -180,7 +180,6 @@ def _slow(record: EpisodeRecord, usual: evidence.UsualFlight) -> bool:
 
 
 def _cause_of_collision(flight: evidence.Evidence, crash: Collision) -> evidence.Cause:
-    """Return why something was hit."""
     if flight.record.navigation_us is None or flight.record.reason.endswith("take-off"):
         return evidence.Cause("hit during the take-off", (f"At {crash.speed_m_s:.1f} m/s.",))
     if crash.before_s is None or crash.blind_m is None:
@@ -257,7 +256,6 @@ def _where(crash: Collision, camera: PolicyCamera | None) -> str:
 
 
 def _side(angle_rad: float) -> str:
-    """Say an angle from the heading."""
     degrees = round(math.degrees(angle_rad))
     if degrees == 0:
         return "straight ahead"

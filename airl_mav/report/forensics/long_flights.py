@@ -51,7 +51,6 @@ class LimitCycle:
     kind: str
     """`yaw`: of the yaw rate; `side`: of the sideways speed."""
     turns: int
-    """Changes of side."""
     start_us: int
     end_us: int
     on_the_spot: bool
@@ -160,12 +159,10 @@ def cause_of_long_flight(flight: Evidence, usual: UsualFlight) -> Cause:
 
 
 def _goal_distance(record: EpisodeRecord, part: Trajectory) -> NDArray[np.float64]:
-    """Return the distance from the goal (n,) [m]: seen from above, if it has no height."""
     return np.array([goal_distance_m(record.goal, here) for here in part.position])
 
 
 def _approach(record: EpisodeRecord, part: Trajectory, start_us: int) -> str:
-    """Say how close to the goal a flight came."""
     away = _goal_distance(record, part)
     best = int(away.argmin())
     after = (part.time_us[best] - start_us) / US_PER_S
@@ -176,7 +173,6 @@ def _approach(record: EpisodeRecord, part: Trajectory, start_us: int) -> str:
 
 
 def _swinging(swing: LimitCycle | None, start_us: int) -> Cause | None:
-    """Say that the commands swung left and right on the spot."""
     if swing is None or not swing.on_the_spot:
         return None
     side = "turned left and right" if swing.kind == "yaw" else "moved left and right"
@@ -190,7 +186,6 @@ def _swinging(swing: LimitCycle | None, start_us: int) -> Cause | None:
 
 
 def _circling(part: Trajectory) -> Cause | None:
-    """Say that the vehicle turned round and round."""
     heading = headings(part.quaternion)
     turns = float(heading[-1] - heading[0]) / (2.0 * math.pi)
     if abs(turns) < CIRCLES:
@@ -200,7 +195,6 @@ def _circling(part: Trajectory) -> Cause | None:
 
 
 def _standing(part: Trajectory) -> Cause | None:
-    """Say that the vehicle stood still."""
     steps_s = np.diff(part.time_us) / US_PER_S
     stood_s = float(steps_s[part.speed()[1:] < STILL_M_S].sum())
     share = stood_s / float(steps_s.sum())
@@ -212,7 +206,6 @@ def _standing(part: Trajectory) -> Cause | None:
 def _late_decision(
     stamps: Mapping[str, NDArray[Any]], start_us: int, ended_us: int
 ) -> Cause | None:
-    """Say that a command was long in coming."""
     sent = stamps.get("sent_us", np.zeros(0, np.int64))
     times = sent[(sent != NO_STAMP) & (sent <= ended_us)]
     gaps = np.diff(times)
@@ -226,7 +219,6 @@ def _late_decision(
 
 
 def _passed_goal(record: EpisodeRecord, part: Trajectory, start_us: int) -> Cause | None:
-    """Say that the vehicle passed the goal closely and left again."""
     away = _goal_distance(record, part)
     # What is still to come of the greatest distance: a pass is a dip before it.
     later = np.maximum.accumulate(away[::-1])[::-1]
@@ -245,7 +237,6 @@ def _passed_goal(record: EpisodeRecord, part: Trajectory, start_us: int) -> Caus
 
 
 def _detour(flight: Evidence) -> Cause | None:
-    """Say whether something stood on the straight way to the goal."""
     excess = path_excess(flight.record)
     if flight.arena is None or excess is None or excess < DETOUR_EXCESS:
         return None
@@ -258,7 +249,6 @@ def _detour(flight: Evidence) -> Cause | None:
 
 
 def _slow_flight(record: EpisodeRecord, usual: UsualFlight) -> Cause | None:
-    """Say that the vehicle flew slowly."""
     if record.quality is None or usual.speed_m_s is None:
         return None
     speed = record.quality.mean_speed_m_s
@@ -269,7 +259,6 @@ def _slow_flight(record: EpisodeRecord, usual: UsualFlight) -> Cause | None:
 
 
 def _time_limit_too_short(record: EpisodeRecord, usual: UsualFlight) -> Cause | None:
-    """Say that no usual flight would have arrived within the time limit."""
     if record.outcome is not Outcome.TIMEOUT or usual.pace_s_m is None:
         return None
     needs_s = usual.pace_s_m * straight_m(record)
@@ -281,6 +270,5 @@ def _time_limit_too_short(record: EpisodeRecord, usual: UsualFlight) -> Cause | 
 
 
 def _power(part: Trajectory) -> str:
-    """Say what emptied the battery."""
     time_s = (part.time_us[-1] - part.time_us[0]) / US_PER_S
     return f"{time_s:.0f} s at {part.power_w[1:].mean():.0f} W on average emptied the battery."

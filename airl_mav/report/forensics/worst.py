@@ -105,7 +105,6 @@ def worst_table(judged: Sequence[ExaminedFlight], total: int) -> TableView:
 
 
 def _row(judged: ExaminedFlight) -> tuple[str, ...]:
-    """Return one flight's cells."""
     record = judged.record
     began_us = record.started_us if record.navigation_us is None else record.navigation_us
     arrived = record.outcome is Outcome.SUCCESS

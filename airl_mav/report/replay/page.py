@@ -173,7 +173,6 @@ class ReplayPage:
             self.draw()
 
     def _fly(self, name: str) -> None:
-        """Show another run: its flight of the same seed, or else its worst. Raises UsageError."""
         if self._runs is None:
             return
         run = self._runs.run(name)
@@ -186,7 +185,6 @@ class ReplayPage:
         self._choose(record)
 
     def _pair(self, name: str) -> None:
-        """Let flights of another run fly beside, or none. Raises UsageError."""
         if self._runs is None:
             return
         beside = None if name == ALONE else self._runs.run(name)
@@ -197,7 +195,6 @@ class ReplayPage:
         self._accompany(self._flight.record)
 
     def _choose(self, record: EpisodeRecord) -> None:
-        """Show another flight, from its beginning."""
         self._flight = self._run.flight(record)
         self._flight.begin(self._shown)
         self._accompany(record)
@@ -222,7 +219,6 @@ class ReplayPage:
         return max(0.0, (record.navigation_us - record.started_us) / US_PER_S - BEFORE_S)
 
     def _next_decision_s(self) -> float:
-        """Return when the next decision is sent [s]; the end where none is."""
         now_us = self._flight.time_us(self._seconds)
         later = self._flight.sent_us[self._flight.sent_us > now_us + 1]
         if not len(later):
@@ -297,5 +293,4 @@ class ReplayPage:
 
 
 def _label(record: EpisodeRecord) -> str:
-    """Return what a flight is called in the list."""
     return f"{record.index:03d}  seed {record.seed}  {record.outcome.value}"

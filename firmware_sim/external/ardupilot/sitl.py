@@ -205,7 +205,6 @@ class ArdupilotBridge:
             self._socket.settimeout(_SLICE_S)
 
     def _next(self, answered: ServoPacket, line: bytes) -> ServoPacket:
-        """Wait for the packet after the one that was answered with `line`."""
         stopwatch = WallClock()
         repeated = False
         while True:
@@ -278,7 +277,6 @@ def _follows(before: ServoPacket, after: ServoPacket) -> ServoPacket:
 
 
 def _motors(pwm_us: tuple[int, ...]) -> tuple[float, float, float, float]:
-    """Return the commands 0..1 of outputs 1 to 4, in this order."""
     span_us = PWM_MAX_US - PWM_MIN_US
     a, b, c, d = (min(max((pwm - PWM_MIN_US) / span_us, 0.0), 1.0) for pwm in pwm_us[:MOTORS])
     return a, b, c, d

@@ -226,7 +226,6 @@ def _known(values: Vector | None, width: int) -> tuple[float, ...]:
 
 
 def _saturated(measured: Vector, limit: float) -> tuple[float, float, float]:
-    """Return three axes, each within +-limit."""
     x, y, z = measured.tolist()
     if -limit <= x <= limit and -limit <= y <= limit and -limit <= z <= limit:
         return x, y, z
@@ -238,7 +237,6 @@ def _within(value: float, limit: float) -> float:
 
 
 def _geodetic(point: Geodetic) -> tuple[int, int, int]:
-    """Return latitude, longitude [1e-7 deg], altitude [mm]."""
     return (
         round(point.latitude_deg * _DEGREES),
         round(point.longitude_deg * _DEGREES),
@@ -247,6 +245,5 @@ def _geodetic(point: Geodetic) -> tuple[int, int, int]:
 
 
 def _fit(value: float, limits: tuple[int, int]) -> int:
-    """Return the nearest integer that the field holds."""
     low, high = limits
     return round(min(high, max(low, value)))

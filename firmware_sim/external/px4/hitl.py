@@ -139,7 +139,6 @@ class HitlBridge:
         link.close()
 
     def _check(self, now_us: int) -> None:
-        """Raise when the flight is over."""
         board, device = self._link.board, self._link.device
         if self._link.lost is not None:
             raise FirmwareLostError(self._link.lost)

@@ -41,7 +41,6 @@ class Px4Program:
 
     binary: Path
     etc: Path
-    """Folder of its start-up scripts."""
 
     def start(self, instance: int, airframe: int, folder: Path) -> StartCommand:
         """Return the command to start an instance with an airframe (SYS_AUTOSTART)."""

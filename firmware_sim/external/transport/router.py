@@ -43,7 +43,6 @@ class Frame(NamedTuple):
 
     raw: bytes
     number: int
-    """Message id."""
     message: WireMessage
 
     @property

@@ -16,7 +16,6 @@ WATCH_S = 0.1
 """Longest wait without checking that the other program is alive [wall s]."""
 
 CHUNK = 65_536
-"""Bytes read at once."""
 
 _READ, _WRITE = select.POLLIN, select.POLLOUT
 
