@@ -273,7 +273,7 @@ class OnNetwork:
         """Join the vehicle, if it is heard; return whether that has happened just now."""
         if self._component is not None:
             return False
-        system = _vehicle(self._mavsdk)
+        system = next((each for each in self._mavsdk.get_systems() if each.has_autopilot()), None)
         if system is None:
             return False
         number = system.get_system_id()
@@ -289,10 +289,6 @@ class OnNetwork:
         if self._component is not None:
             self._component.close()
         self._mavsdk.destroy()
-
-
-def _vehicle(mavsdk: Mavsdk) -> Any:
-    return next((system for system in mavsdk.get_systems() if system.has_autopilot()), None)
 
 
 class ShownCamera(NamedTuple):

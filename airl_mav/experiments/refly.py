@@ -26,7 +26,7 @@ from airl_mav.flight.statistics import successful
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.profiles.arena import ArenaSpec, Size
 from airl_mav.profiles.conditions import WindSettings
-from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder, RunInfo
+from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
 from airl_mav.report.recorded_flight import episode_of, info_of, settings_of
 from airl_mav.scenario.model import Decisions, Scenario
 from airl_mav.scenario.resolve import resolve
@@ -167,7 +167,7 @@ def refly(
     record = replace(
         episode.record, arena=scenario.arena, arena_seed=scenario.arena_seed_of(scenario.seed)
     )
-    _save(replace(episode, record=record), info, out / FLOWN)
+    RunFolder.adopt(out / FLOWN, info).save_episodes([replace(episode, record=record)])
     run = rehearse(scenario, out=out / REHEARSED, progress=progress)
     flown = _navigated(episode.trajectory, record)
     paths = [
@@ -310,7 +310,3 @@ def _check_goal(scenario: Scenario, episode: FlownEpisode) -> None:
             f"one with the goal of the flight, {flown[0]:.1f} m north and {flown[1]:.1f} m east of"
             f" the start, not {goal[0]:.1f} and {goal[1]:.1f}",
         )
-
-
-def _save(episode: FlownEpisode, info: RunInfo, folder: Path) -> None:
-    RunFolder.adopt(folder, info).save_episodes([episode])

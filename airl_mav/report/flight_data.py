@@ -61,7 +61,9 @@ def flight_data(
         "estimated": None if flight.estimated is None else _lines(flight.estimated, keep),
         "errors": None if flight.errors is None else _lines(flight.errors, keep),
         "power": None if flight.power_w is None else steps_of(flight.power_w[keep], 1.0),
-        "motors": None if flight.motors is None else _outputs(flight.motors[keep]),
+        "motors": None
+        if flight.motors is None
+        else [steps_of(column, 0.002) for column in flight.motors[keep].T],
         "altitude": flight.altitude_m,
         "commands": {
             "sent": steps_of(commands.sent_s, 0.001),
@@ -75,10 +77,6 @@ def flight_data(
 def _lines(of: Motion | EstimateErrors, keep: NDArray[np.int64]) -> dict[str, Steps]:
     known = {name: values for name, values in vars(of).items() if values is not None}
     return {name: steps_of(values[keep], _unit(name)) for name, values in known.items()}
-
-
-def _outputs(motors: NDArray[np.float64]) -> list[Steps]:
-    return [steps_of(column, 0.002) for column in motors.T]
 
 
 def _unit(name: str) -> float:

@@ -277,7 +277,10 @@ class ExportRequest(BaseModel):
             raise FieldError("weights", self.weights, "with a module of your own")
         if self.vec_normalize is not None and self.own_module:
             raise FieldError("vec_normalize", self.vec_normalize, "with a .zip")
-        known: dict[str, Any] = {**DEFAULTS, **{k: v for k, v in _given(taken).items() if v}}
+        known: dict[str, Any] = {
+            **DEFAULTS,
+            **{k: v for k, v in (taken._asdict() if taken else {}).items() if v},
+        }
         environment = None if self.like is None else _environment(self.like)
         if environment is not None:
             known |= _known_of(environment)
@@ -304,10 +307,6 @@ class ExportRequest(BaseModel):
             ),
         }
         return validated(PolicyFacts, facts)
-
-
-def _given(taken: Taken | None) -> dict[str, Any]:
-    return {} if taken is None else taken._asdict()
 
 
 def _environment(name: str) -> EnvironmentSpec:

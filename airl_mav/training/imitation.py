@@ -251,7 +251,9 @@ class Imitation(BaseAlgorithm):
         """Make one update and return its loss."""
         observations, actions = self.replay.sample(self.batch_size, self.generator)
         wanted = torch.from_numpy(actions).to(self.device)
-        distribution = self.policy.get_distribution(self._tensors(observations))
+        distribution = self.policy.get_distribution(
+            {key: torch.from_numpy(a).to(self.device) for key, a in observations.items()}
+        )
         if isinstance(self.action_space, spaces.Discrete):
             loss = -distribution.log_prob(wanted).mean()
         else:
@@ -261,9 +263,6 @@ class Imitation(BaseAlgorithm):
         torch.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
         self.policy.optimizer.step()
         return loss.item()
-
-    def _tensors(self, arrays: Mapping[str, NDArray[Any]]) -> dict[str, torch.Tensor]:
-        return {key: torch.from_numpy(array).to(self.device) for key, array in arrays.items()}
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "replay", "generator", "_expert"]

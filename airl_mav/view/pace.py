@@ -53,7 +53,11 @@ class Pace:
             self._clock = None
             return
         clock = self._clock
-        if clock is None or clock.speed != asked.speed or self._is_behind(clock, time_us):
+        if (
+            clock is None
+            or clock.speed != asked.speed
+            or clock.time_us() - time_us > BEHIND_S * US_PER_S * clock.speed
+        ):
             self._clock = clock = self._new_clock(asked.speed)
             clock.epoch_ns -= int(time_us * 1_000 / asked.speed)
         clock.sleep_until(time_us)
@@ -78,6 +82,3 @@ class Pace:
             self._left += asked.steps - self._steps
         self._steps = asked.steps
         return asked
-
-    def _is_behind(self, clock: WallClock, time_us: int) -> bool:
-        return clock.time_us() - time_us > BEHIND_S * US_PER_S * clock.speed

@@ -96,7 +96,12 @@ class UlogWriter(LogFile):
         for topic in topics:
             self._message(b"F", topic.definition)
         for key, value in info:
-            self._message(b"I", _text(key, value) if isinstance(value, str) else _whole(key, value))
+            self._message(
+                b"I",
+                _text(key, value)
+                if isinstance(value, str)
+                else _keyed("uint32_t", key, struct.pack("<I", value)),
+            )
         for name, number in parameters:
             self.parameter(name, number)
         for number, topic in enumerate(topics):
@@ -138,10 +143,6 @@ class UlogWriter(LogFile):
 def _text(key: str, value: str) -> bytes:
     data = value.encode("utf-8")
     return _keyed(f"char[{len(data)}]", key, data)
-
-
-def _whole(key: str, value: int) -> bytes:
-    return _keyed("uint32_t", key, struct.pack("<I", value))
 
 
 def _keyed(kind: str, key: str, data: bytes) -> bytes:

@@ -13,7 +13,7 @@ import numpy as np
 from foxglove import messages
 from numpy.typing import NDArray
 
-from airl_mav.arena.geometry import Arena, Bounds, PlacedMesh, Shape
+from airl_mav.arena.geometry import Arena, Bounds, Shape
 from airl_mav.arena.triangles import drawn, standing
 from airl_mav.black_box.channels import Channel
 from airl_mav.core import frames
@@ -141,7 +141,11 @@ def arena_scene(
             for i in range(arena.n_static)
             if arena.mesh_of(i) not in shown
         ]
-        entities += [walls, *still, *(_mesh(each, at) for each in shown)]
+        entities += [
+            walls,
+            *still,
+            *(_surface(f"mesh/{each.first}", *standing(each), STILL, at) for each in shown),
+        ]
     return messages.SceneUpdate(entities=entities)
 
 
@@ -236,10 +240,6 @@ def obstacle(
         return messages.SceneEntity(**entity, spheres=[messages.SpherePrimitive(**look)])
     whole = messages.CylinderPrimitive(**look, bottom_scale=1.0, top_scale=1.0)
     return messages.SceneEntity(**entity, cylinders=[whole])
-
-
-def _mesh(placed: PlacedMesh, at: messages.Timestamp) -> messages.SceneEntity:
-    return _surface(f"mesh/{placed.first}", *standing(placed), STILL, at)
 
 
 def _surface(

@@ -227,18 +227,12 @@ class FlightMessages:
     # --- numbers and texts, as in a black box
 
     def _state(self) -> Iterator[Told]:
-        parts: list[Iterable[Told]] = [self._telemetry(), self._status()]
-        if self.flight.truth is not None:
-            parts.append(self._truth(self.flight.truth))
+        telemetry = (self._ours(row[0], Telemetry(*row)) for row in _rows(self.flight.believed))
+        parts: list[Iterable[Told]] = [telemetry, self._status()]
+        if (truth := self.flight.truth) is not None:
+            rows = zip(_rows(truth), truth.power_w.tolist(), strict=True)
+            parts.append(self._ours(row[0], Truth(*row, watts)) for row, watts in rows)
         return heapq.merge(*parts, key=itemgetter(0))
-
-    def _telemetry(self) -> Iterator[Told]:
-        for state in _rows(self.flight.believed):
-            yield self._ours(state[0], Telemetry(*state))
-
-    def _truth(self, truth: Trajectory) -> Iterator[Told]:
-        for state, power_w in zip(_rows(truth), truth.power_w.tolist(), strict=True):
-            yield self._ours(state[0], Truth(*state, power_w))
 
     def _status(self) -> Iterator[Told]:
         charge = charge_of(self.flight)

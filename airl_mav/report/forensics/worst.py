@@ -79,10 +79,6 @@ def examine_worst(
     return examined
 
 
-def _braking_m(vehicle: VehicleProfile, speed_m_s: float) -> float:
-    return braking_of(vehicle).distance_from_m(speed_m_s)
-
-
 def worst_table(judged: Sequence[ExaminedFlight], total: int) -> TableView:
     """Return the worst flights with their causes."""
     columns = (
@@ -150,3 +146,7 @@ def causes_table(judged: Sequence[ExaminedFlight], run: LoadedRun) -> TableView 
     if all_failed > len(failed):
         notes = (f"The first {len(failed)} of {all_failed:,} flights that failed.",)
     return TableView("causes", "Why flights failed", columns, tuple(rows), notes)
+
+
+def _braking_m(vehicle: VehicleProfile, speed_m_s: float) -> float:
+    return braking_of(vehicle).distance_from_m(speed_m_s)

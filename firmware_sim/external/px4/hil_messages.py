@@ -11,7 +11,7 @@ import math
 from typing import NamedTuple, TypeAlias
 
 from airl_mav.core.constants import DEG, GRAVITY_M_S2, US_PER_S
-from airl_mav.core.frames import Geodetic, Vector
+from airl_mav.core.frames import Vector
 from airl_mav.vehicle.atmosphere import altitude_m
 from firmware_sim import interfaces
 from firmware_sim.mavlink.codec import Reader, Values, WireMessage, dialect, layout
@@ -117,7 +117,9 @@ def gps(fix: interfaces.GpsFix, time_us: int) -> Values:
     return (
         time_us,
         fix.fix_type,
-        *_geodetic(fix.position),
+        round(fix.position.latitude_deg * _DEGREES),
+        round(fix.position.longitude_deg * _DEGREES),
+        _fit(fix.position.altitude_m * _MM, _INT32),
         _fit(fix.eph_m * _CM, _UINT16),
         _fit(fix.epv_m * _CM, _UINT16),
         _fit(speed * _CM, _UINT16),
@@ -234,14 +236,6 @@ def _saturated(measured: Vector, limit: float) -> tuple[float, float, float]:
 
 def _within(value: float, limit: float) -> float:
     return min(limit, max(-limit, value))
-
-
-def _geodetic(point: Geodetic) -> tuple[int, int, int]:
-    return (
-        round(point.latitude_deg * _DEGREES),
-        round(point.longitude_deg * _DEGREES),
-        _fit(point.altitude_m * _MM, _INT32),
-    )
 
 
 def _fit(value: float, limits: tuple[int, int]) -> int:
