@@ -41,8 +41,14 @@ from airl_mav.core.ports import LOOPBACK
 from airl_mav.core.provenance import provenance, usable_cores
 from airl_mav.latency.percentiles import summarize
 from airl_mav.profiles.vehicle import load_vehicle
-from airl_mav.report.saved_table import write_table
-from airl_mav.report.table import DURATION_COLUMNS, Column, TableView, duration_cells, print_table
+from airl_mav.report.table import (
+    DURATION_COLUMNS,
+    Column,
+    TableView,
+    duration_cells,
+    print_table,
+    write_table,
+)
 from firmware_sim.firmware import BuiltinFlightStack, Firmware
 from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.endpoint import Address, Peer, UdpEndpoint, UdpPeer

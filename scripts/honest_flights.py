@@ -32,8 +32,7 @@ from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.statistics import wilson
 from airl_mav.lockstep.flight import fly
 from airl_mav.profiles.conditions import WindSettings
-from airl_mav.report.saved_table import write_table
-from airl_mav.report.table import Column, TableView, print_table
+from airl_mav.report.table import Column, TableView, print_table, write_table
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 from companion.limits import REASONS

@@ -9,8 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from airl_mav.arena.appearance import Statics
-from airl_mav.arena.assets import Things, draw_things, generate_own
-from airl_mav.arena.bodies import Bodies, draw_bodies
+from airl_mav.arena.assets import Bodies, Things, draw_bodies, draw_things, generate_own
 from airl_mav.arena.footprints import Boxes, Floats, bounding_boxes, footprint_areas, join
 from airl_mav.arena.gates import (
     Openings,

@@ -20,17 +20,9 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.appearance import LUMINANCE
 from airl_mav.arena.geometry import Arena
-from airl_mav.camera.image_sensor import (
-    LIGHT_OF,
-    Light,
-    codes_of,
-    demosaiced,
-    mosaic,
-    noisy,
-    vignette,
-)
+from airl_mav.camera import image_sensor
+from airl_mav.camera.frame import image_of, jpeg_of
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.jpeg import image_of, jpeg_of
 from airl_mav.camera.picture import grey, render_picture
 from airl_mav.camera.render import Motion, Mount, camera_pose, carried_on
 from airl_mav.core.constants import US_PER_MS, US_PER_S
@@ -66,7 +58,7 @@ class ImageFormation:
         self._mount = Mount.of(camera)
         self._period_s = camera.period_us / US_PER_S
         share = self._imaging.vignetting
-        self._through = vignette(self._camera, share)[..., None] if share else None
+        self._through = image_sensor.vignette(self._camera, share)[..., None] if share else None
         self.restart()
 
     def restart(self) -> None:
@@ -99,7 +91,9 @@ class ImageFormation:
         light = self._exposed(arena, elapsed_us, motion, self.gain)
         return self._formed(light, self.gain, seed, frame)
 
-    def _exposed(self, arena: Arena, elapsed_us: int, motion: Motion, gain: float) -> Light:
+    def _exposed(
+        self, arena: Arena, elapsed_us: int, motion: Motion, gain: float
+    ) -> image_sensor.Light:
         """Return the light (h, w, channels) of all rows, each exposed when the shutter has it."""
         readout_us = US_PER_MS * self._imaging.readout_ms
         if not readout_us:
@@ -118,7 +112,7 @@ class ImageFormation:
 
     def _exposed_at(
         self, arena: Arena, elapsed_us: int, motion: Motion, middle_us: float, gain: float
-    ) -> Light:
+    ) -> image_sensor.Light:
         """Return the light (h, w, channels) of an exposure, its middle so long after the stamp."""
         asked = self._imaging
         count = asked.samples if asked.exposure_ms else 1
@@ -127,10 +121,10 @@ class ImageFormation:
             for k in range(count)
         )
         lights = (
-            LIGHT_OF[self._codes(arena, elapsed_us + since_us, motion, since_us, gain)]
+            image_sensor.LIGHT_OF[self._codes(arena, elapsed_us + since_us, motion, since_us, gain)]
             for since_us in moments_us
         )
-        total: Light = reduce(np.add, lights)
+        total: image_sensor.Light = reduce(np.add, lights)
         return total if count == 1 else total * np.float32(1.0 / count)
 
     def _codes(
@@ -171,19 +165,19 @@ class ImageFormation:
                 break
         return float(gain)
 
-    def _formed(self, light: Light, gain: float, seed: int, frame: int) -> Taken:
+    def _formed(self, light: image_sensor.Light, gain: float, seed: int, frame: int) -> Taken:
         """Return the image that lens and sensor make of light (h, w, channels)."""
         asked, channels = self._imaging, light.shape[2]
         if self._through is not None:
             light = light * self._through
         if asked.bayer:
-            light = mosaic(light)
+            light = image_sensor.mosaic(light)
         if asked.full_well_e is not None:
             rng = stream(seed, Stream.PHOTONS, frame, *self._own)
-            light = noisy(light, gain, asked.full_well_e, asked.read_noise_e, rng)
+            light = image_sensor.noisy(light, gain, asked.full_well_e, asked.read_noise_e, rng)
         if asked.bayer:
-            light = demosaiced(np.minimum(light, np.float32(1.0)))
-        image: NDArray[Any] = codes_of(light)
+            light = image_sensor.demosaiced(np.minimum(light, np.float32(1.0)))
+        image: NDArray[Any] = image_sensor.codes_of(light)
         if asked.jpeg_quality is None:
             return Taken(image, None)
         jpeg = jpeg_of(image, asked.jpeg_quality)
@@ -204,5 +198,5 @@ def _mean_light(codes: NDArray[np.uint8]) -> float:
     mean = 0.0
     for channel, weight in enumerate(weights.tolist()):
         counts = np.bincount(codes[..., channel].ravel(), minlength=256)
-        mean += weight * float(counts @ LIGHT_OF.astype(np.float64)) / counts.sum()
+        mean += weight * float(counts @ image_sensor.LIGHT_OF.astype(np.float64)) / counts.sum()
     return mean

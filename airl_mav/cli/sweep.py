@@ -17,8 +17,7 @@ from airl_mav.experiments.process_executor import open_executor
 from airl_mav.rehearsal.signals import stop_on_signals
 from airl_mav.report.document import print_document, write_document
 from airl_mav.sweep.document import document_of
-from airl_mav.sweep.request import SweepRequest
-from airl_mav.sweep.run import run_sweep
+from airl_mav.sweep.run import SweepRequest, run_sweep
 from airl_mav.sweep.tables import print_plan
 
 

@@ -18,10 +18,16 @@ from airl_mav.profiles.conditions import Payload
 from airl_mav.profiles.loaded import loaded
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from airl_mav.refitting.air import Air, fit_air
-from airl_mav.refitting.files import computer_profile, vehicle_toml, write_refit
+from airl_mav.refitting.files import (
+    Override,
+    computer_profile,
+    overrides_of,
+    refitted,
+    vehicle_toml,
+    write_refit,
+)
 from airl_mav.refitting.flown import Flown, flown_by_log, flown_of
 from airl_mav.refitting.latencies import Latencies, fit_latencies, no_latencies
-from airl_mav.refitting.overrides import Override, overrides_of, refitted
 from airl_mav.refitting.quantity import FittedQuantity
 from airl_mav.refitting.response import ResponseFit, fit_response
 from airl_mav.refitting.thrust import Known, Thrust, fit_thrust

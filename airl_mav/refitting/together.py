@@ -19,9 +19,8 @@ from airl_mav.core.errors import FieldError
 from airl_mav.flight.statistics import QUANTILE
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.refitting.air import Air
-from airl_mav.refitting.files import vehicle_toml, write_refit
+from airl_mav.refitting.files import overrides_of, refitted, vehicle_toml, write_refit
 from airl_mav.refitting.latencies import no_latencies
-from airl_mav.refitting.overrides import overrides_of, refitted
 from airl_mav.refitting.quantity import Array, FittedQuantity, unobserved
 from airl_mav.refitting.refit import LOG_SUFFIX, Refit, check_out, refit
 from airl_mav.refitting.response import ResponseFit

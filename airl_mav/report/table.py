@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
 
+from pydantic import TypeAdapter
 from rich import box
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 from airl_mav.core.constants import US_PER_MS
+from airl_mav.core.files import read_typed, write_json
 from airl_mav.flight.judge import Outcome
 from airl_mav.latency.percentiles import MIN_SAMPLES, Summary
 
@@ -164,3 +167,41 @@ def count_outcomes(outcomes: Sequence[Outcome]) -> str:
         for outcome, label in OUTCOME_LABELS.items()
         if outcome in outcomes
     )
+
+
+SCHEMA = 1
+
+TABLE_FILE = "table.json"
+
+
+@dataclass(frozen=True)
+class SavedTable:
+    """What the file holds."""
+
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    notes: tuple[str, ...]
+    policies: tuple[str, ...]
+    made: Mapping[str, Any]
+    """With what (`core.provenance.provenance`)."""
+
+
+_SAVED = TypeAdapter(SavedTable)
+
+
+def write_table(
+    view: TableView, folder: Path, made: Mapping[str, Any], policies: Sequence[str] = ()
+) -> Path:
+    """Write a table into a folder, whole or not at all; return its path."""
+    columns = tuple(f"{c.title}, {c.unit}" if c.unit else c.title for c in view.columns)
+    saved = SavedTable(view.title, columns, view.rows, view.notes, tuple(policies), made)
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / TABLE_FILE
+    write_json(path, {"schema": SCHEMA, **asdict(saved)})
+    return path
+
+
+def read_table(folder: Path) -> SavedTable:
+    """Read the table of a folder. Raises UsageError: it is missing or damaged."""
+    return read_typed(folder / TABLE_FILE, _SAVED, SCHEMA, "table")

@@ -19,7 +19,7 @@ from airl_mav.experiments.run import load_run
 from airl_mav.flight.statistics import NO_ESTIMATE, Aggregate
 from airl_mav.rehearsal.run_folder import RunInfo, load_info
 from airl_mav.report.comparison.model import Comparison, load_comparison
-from airl_mav.report.saved_table import read_table
+from airl_mav.report.table import read_table
 from airl_mav.sweep.store import SCHEMA as SWEEP_SCHEMA
 from airl_mav.sweep.store import SWEEP_FILE
 from published.declared import Declared

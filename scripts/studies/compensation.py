@@ -38,8 +38,7 @@ from airl_mav.prediction.compensator import Compensator
 from airl_mav.prediction.lateness import REMEMBERED, ExpectedLatency
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.report.measures import rate_with_interval, with_interval
-from airl_mav.report.saved_table import write_table
-from airl_mav.report.table import NONE, Column, TableView, markdown_table, print_table
+from airl_mav.report.table import NONE, Column, TableView, markdown_table, print_table, write_table
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 

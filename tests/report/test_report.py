@@ -23,8 +23,8 @@ from airl_mav.rehearsal.run_folder import LoadedRun, RunFolder, load
 from airl_mav.report.ages import ages_table, run_ages
 from airl_mav.report.conduct import conduct_table
 from airl_mav.report.energy import energy_flights_table, energy_table, flight_energies
+from airl_mav.report.flight_data import unpacked
 from airl_mav.report.forensics.worst import examine_worst
-from airl_mav.report.packing import unpacked
 from airl_mav.report.run_page import build_page
 from airl_mav.report.run_report import print_report
 from airl_mav.report.run_summary import summarize_run

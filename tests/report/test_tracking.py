@@ -12,8 +12,7 @@ from airl_mav.core.frames import quat_wxyz_to_xyzw
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.rehearsal.run_folder import LoadedRun, load
 from airl_mav.report.ages import estimation_table
-from airl_mav.report.flight_data import chosen, flight_data
-from airl_mav.report.packing import packed, steps_of, unpacked
+from airl_mav.report.flight_data import chosen, flight_data, packed, steps_of, unpacked
 from airl_mav.report.tracking import track
 from airl_mav.report.tracking_figure import held
 from tests.support.run_demo import write_demo_run

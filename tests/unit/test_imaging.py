@@ -17,7 +17,7 @@ from scipy import stats
 from airl_mav.arena.geometry import Arena, Shape, Tour
 from airl_mav.camera.conditions import check_renderer
 from airl_mav.camera.exposure import expose
-from airl_mav.camera.frame import Frame, FrameError
+from airl_mav.camera.frame import Frame, FrameError, image_of, jpeg_of
 from airl_mav.camera.image_sensor import (
     LIGHT_OF,
     codes_of,
@@ -28,7 +28,6 @@ from airl_mav.camera.image_sensor import (
 )
 from airl_mav.camera.imaging import ImageFormation
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.jpeg import image_of, jpeg_of
 from airl_mav.camera.render import Motion
 from airl_mav.core.errors import FieldError
 from airl_mav.core.frames import quat_from_euler

@@ -16,8 +16,8 @@ from airl_mav.core.errors import UsageError
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from airl_mav.refitting.air import fit_air
+from airl_mav.refitting.files import Override, overrides_of, refitted
 from airl_mav.refitting.flown import Flown
-from airl_mav.refitting.overrides import Override, overrides_of, refitted
 from airl_mav.refitting.quantity import block_intervals, mean_interval
 from airl_mav.refitting.response import TELEMETRY_AGE_S, fit_response
 from airl_mav.refitting.thrust import fit_thrust
