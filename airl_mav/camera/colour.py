@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from airl_mav.arena.appearance import FLOOR as FLOOR_ROW
 from airl_mav.arena.appearance import OBSTACLE as OBSTACLE_ROW
 from airl_mav.arena.appearance import WALLS as WALLS_ROW
+from airl_mav.camera import surfaces
 from airl_mav.camera.bvh import Meshes, count_of, is_owned, raised
 from airl_mav.camera.gloss import Gloss, let_through
 from airl_mav.camera.mesh_shadows import shade_by_meshes
@@ -27,14 +28,6 @@ from airl_mav.camera.raycast import aim, blank, draw_bodies, invert
 from airl_mav.camera.reflections import draw_reflections
 from airl_mav.camera.shading import F32, ZERO, Lit, Packed, Plane, Points, Rays, surface_of
 from airl_mav.camera.shadows import CORNERS, shade_by_obstacle, shade_by_walls
-from airl_mav.camera.surfaces import (
-    BLOCK,
-    draw_sky,
-    shade_floor,
-    shade_obstacle,
-    shade_walls,
-    write_rays,
-)
 from airl_mav.core.kernels import borrowing_kernel, kernel
 from airl_mav.vehicle.rotation import Quat, Vec
 
@@ -62,7 +55,7 @@ class Work(NamedTuple):
     def of(cls, width: int, height: int, cylindrical: bool) -> Work:
         """Return the room for images of a size; lines are rows, or columns of a cylinder."""
         n, m = (width, height) if cylindrical else (height, width)
-        block = max(BLOCK, m)
+        block = max(surfaces.BLOCK, m)
 
         def floats(*shape: int) -> Plane:
             return np.zeros(shape, np.float32)
@@ -192,7 +185,7 @@ def _show(
     lines, xs = work.lines, work.xs
     light = _lit(lights)
     lit, clear, out, points, rays = work.lit, work.clear, work.out, work.points, work.rays
-    write_rays(rays, lines, xs, bent, axes)
+    surfaces.write_rays(rays, lines, xs, bent, axes)
     to_sun = (float(lights[0, 0]), float(lights[0, 1]), float(lights[0, 2]))
     count = ids.size
     all_ids, all_far = ids.reshape(count), far.reshape(count)
@@ -215,14 +208,14 @@ def _show(
             lit, far, ids, faces, work.corners, lines, xs, bent, view, axes, camera, meshes, to_sun,
             gloss,
         )  # fmt: skip
-    draw_sky(out, all_ids, points, rays, camera, light)
+    surfaces.draw_sky(out, all_ids, points, rays, camera, light)
     pixel2 = F32(1.0 / (view.focal * view.focal))
     floor = surface_of(texture, per_m, offset, albedo, FLOOR_ROW)
     walls = surface_of(texture, per_m, offset, albedo, WALLS_ROW)
-    shade_floor(
+    surfaces.shade_floor(
         out, all_ids, all_far, all_lit, all_clear, points, rays, camera, floor, light, atlas, pixel2
     )
-    shade_walls(
+    surfaces.shade_walls(
         out, all_ids, all_far, all_lit, all_clear, points, rays, camera, walls, light, atlas, pixel2
     )
     if meshes is not None and faces is not None:
@@ -237,7 +230,7 @@ def _show(
         world, half = _placed(axes, camera, center, half_size, i)
         surface = surface_of(texture, per_m, offset, albedo, OBSTACLE_ROW + i)
         for k in range(3 if view.cylindrical else 1):
-            shade_obstacle(
+            surfaces.shade_obstacle(
                 out, all_ids, all_far, all_lit, all_clear, points, rectangles[i, k], i, lines, xs,
                 bent, world, shape[i], half, yaw[i], surface, light, atlas, pixel2,
             )  # fmt: skip

@@ -5,25 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.camera import shading
 from airl_mav.camera.bvh import Meshes, material_row
 from airl_mav.camera.mesh_triangles import Faces
 from airl_mav.camera.patterns import STEEP, on_triangle, texels2
 from airl_mav.camera.primitives import OBSTACLE, Ids, Line, Lines, Rectangles, turned
 from airl_mav.camera.projection import Bent, Pose
-from airl_mav.camera.shading import (
-    F32,
-    I32,
-    ONE,
-    ZERO,
-    Lit,
-    Packed,
-    Plane,
-    Points,
-    Surface,
-    paint,
-    surface_of,
-    texel_at,
-)
 from airl_mav.camera.shadows import along32, ray32, start32
 from airl_mav.camera.surfaces import span_of
 from airl_mav.core.kernels import large_borrowing_kernel
@@ -32,12 +19,12 @@ from airl_mav.vehicle.rotation import Vec
 
 @large_borrowing_kernel
 def shade_meshes(
-    out: Packed,
+    out: shading.Packed,
     ids: Ids,
-    far: Plane,
-    lit: Plane,
-    clear: Plane,
-    points: Points,
+    far: shading.Plane,
+    lit: shading.Plane,
+    clear: shading.Plane,
+    points: shading.Points,
     rectangles: Rectangles,
     meshes: Meshes,
     faces: Faces,
@@ -50,8 +37,8 @@ def shade_meshes(
     per_m: NDArray[np.float32],
     offset: NDArray[np.float32],
     albedo: NDArray[np.float32],
-    light: Lit,
-    atlas: Plane,
+    light: shading.Lit,
+    atlas: shading.Plane,
     pixel2: np.float32,
 ) -> None:
     """Shade the visible flat triangles of meshes, with a pattern along the nearest mesh axis.
@@ -81,7 +68,7 @@ def shade_meshes(
     """
     for k in range(len(meshes.first)):
         rectangle = rectangles[len(meshes.owner) + k, 0]
-        surface = surface_of(texture, per_m, offset, albedo, material_row(meshes, k))
+        surface = shading.surface_of(texture, per_m, offset, albedo, material_row(meshes, k))
         _shade_mesh(
             out, ids, far, lit, clear, points, rectangle, meshes, k, faces, lines, xs, bent, axes,
             camera, surface, light, atlas, pixel2,
@@ -90,12 +77,12 @@ def shade_meshes(
 
 @large_borrowing_kernel
 def _shade_mesh(
-    out: Packed,
+    out: shading.Packed,
     ids: Ids,
-    far: Plane,
-    lit: Plane,
-    clear: Plane,
-    points: Points,
+    far: shading.Plane,
+    lit: shading.Plane,
+    clear: shading.Plane,
+    points: shading.Points,
     rectangle: NDArray[np.int32],
     meshes: Meshes,
     k: int,
@@ -105,9 +92,9 @@ def _shade_mesh(
     bent: Bent | None,
     axes: Pose,
     camera: Vec,
-    surface: Surface,
-    light: Lit,
-    atlas: Plane,
+    surface: shading.Surface,
+    light: shading.Lit,
+    atlas: shading.Plane,
     pixel2: np.float32,
 ) -> None:
     """Shade what is seen of mesh k in a rectangle (4,) of the image."""
@@ -118,15 +105,19 @@ def _shade_mesh(
         meshes.pose[k, 5] - camera[2],
     )
     pose = turned(Pose(axes.forward, axes.across, axes.along, offset), cos, sin)
-    c0, c1, c2 = F32(pose.center[0]), F32(pose.center[1]), F32(pose.center[2])
+    c0, c1, c2 = (
+        shading.F32(pose.center[0]),
+        shading.F32(pose.center[1]),
+        shading.F32(pose.center[2]),
+    )
     r = along32(pose)
-    s0 = F32(cos * light.to_sun[0] + sin * light.to_sun[1])
-    s1 = F32(cos * light.to_sun[1] - sin * light.to_sun[0])
+    s0 = shading.F32(cos * light.to_sun[0] + sin * light.to_sun[1])
+    s1 = shading.F32(cos * light.to_sun[1] - sin * light.to_sun[0])
     s2 = light.to_sun[2]
     texel, per_m = texels2(surface, pixel2), surface.per_m
     begin_u, begin_v = surface.offset[0], surface.offset[1]
     normals = meshes.bvh.normals
-    own = I32(OBSTACLE + meshes.first[k])
+    own = shading.I32(OBSTACLE + meshes.first[k])
     for v in range(rectangle[0], rectangle[1]):
         line = v * len(xs)
         low, high = line + rectangle[2], line + rectangle[3]
@@ -138,18 +129,20 @@ def _shade_mesh(
             u = at - left
             if ids[at] != own:
                 # It is not painted; its place must only be one of the pattern.
-                points.place[u] = I32(1)
+                points.place[u] = shading.I32(1)
                 continue
             t, i = far[at], faces[at]
-            n, e, d = ray32(pose, r, bent, v, at - line, start, F32(xs[at - line]))
+            n, e, d = ray32(pose, r, bent, v, at - line, start, shading.F32(xs[at - line]))
             n0, n1, n2 = normals[i, 0], normals[i, 1], normals[i, 2]
             normal = n0 * n + n1 * e + n2 * d
             # The side that is seen faces the camera.
-            side = -ONE if normal > ZERO else ONE
+            side = -shading.ONE if normal > shading.ZERO else shading.ONE
             a, b, c = t * n - c0, t * e - c1, t * d - c2
             across, along = on_triangle(a, b, c, n0, n1, n2)
             texels = texel * t * t / max(abs(normal), STEEP)
-            points.place[u] = texel_at(across * per_m + begin_u, along * per_m + begin_v, texels)
-            points.facing[u] = max(side * (n0 * s0 + n1 * s1 + n2 * s2), ZERO)
+            points.place[u] = shading.texel_at(
+                across * per_m + begin_u, along * per_m + begin_v, texels
+            )
+            points.facing[u] = max(side * (n0 * s0 + n1 * s1 + n2 * s2), shading.ZERO)
             points.up[u] = -side * n2
-        paint(out, ids, lit, clear, left, end, own, own, points, surface, light, atlas)
+        shading.paint(out, ids, lit, clear, left, end, own, own, points, surface, light, atlas)

@@ -17,19 +17,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.camera import projection
 from airl_mav.camera.bvh import STACK, Bvh, Meshes
 from airl_mav.camera.mesh_triangles import Faces, draw_triangle, met, part_of
 from airl_mav.camera.primitives import OBSTACLE, Ids, Line, Lines, Rectangles, turned
-from airl_mav.camera.projection import (
-    Bent,
-    Image,
-    Pose,
-    Rectangle,
-    View,
-    dot,
-    fisheye_rectangle,
-    ray_of,
-)
 from airl_mav.core.kernels import borrowing_kernel, kernel, large_borrowing_kernel, large_kernel
 from airl_mav.vehicle.rotation import Vec
 
@@ -41,25 +32,29 @@ _MOST_LOOKED_AT: Final = 256
 
 
 @borrowing_kernel
-def seen_from(axes: Pose, camera: Vec, pose: NDArray[np.float64], k: int) -> Pose:
+def seen_from(
+    axes: projection.Pose, camera: Vec, pose: NDArray[np.float64], k: int
+) -> projection.Pose:
     """Return the camera's axes along mesh k's, and its origin from the camera, in units of it."""
     per = 1.0 / pose[k, 4]
     offset = (pose[k, 0] - camera[0], pose[k, 1] - camera[1], pose[k, 5] - camera[2])
     at = (per * offset[0], per * offset[1], per * offset[2])
-    return turned(Pose(axes.forward, axes.across, axes.along, at), pose[k, 2], pose[k, 3])
+    return turned(
+        projection.Pose(axes.forward, axes.across, axes.along, at), pose[k, 2], pose[k, 3]
+    )
 
 
 @large_kernel
 def draw_meshes(
-    out: Image,
+    out: projection.Image,
     ids: Ids | None,
     faces: Faces | None,
     drawn_in: Rectangles | None,
     lines: Lines,
     xs: Line,
-    bent: Bent | None,
-    view: View,
-    axes: Pose,
+    bent: projection.Bent | None,
+    view: projection.View,
+    axes: projection.Pose,
     camera: Vec,
     meshes: Meshes,
 ) -> None:
@@ -100,15 +95,15 @@ def draw_meshes(
 
 @large_borrowing_kernel
 def _draw_mesh(
-    out: Image,
+    out: projection.Image,
     ids: Ids | None,
     faces: Faces | None,
     drawn_in: Rectangles | None,
     number: int,
     lines: Lines,
     xs: Line,
-    view: View,
-    pose: Pose,
+    view: projection.View,
+    pose: projection.Pose,
     bvh: Bvh,
     root: int,
     scale: float,
@@ -116,7 +111,7 @@ def _draw_mesh(
     nearest: NDArray[np.float64],
 ) -> None:
     """Draw one mesh; `view` and `pose` are in metres and in units of the mesh."""
-    own = View(
+    own = projection.View(
         view.focal, view.line_centre, view.pixel_centre, view.s_min * scale, view.cylindrical
     )
     per = 1.0 / scale
@@ -173,14 +168,14 @@ def _draw_mesh(
 
 @large_borrowing_kernel
 def _cast_mesh(
-    out: Image,
+    out: projection.Image,
     ids: Ids | None,
     faces: Faces | None,
     drawn_in: Rectangles | None,
     number: int,
-    bent: Bent,
-    view: View,
-    pose: Pose,
+    bent: projection.Bent,
+    view: projection.View,
+    pose: projection.Pose,
     bvh: Bvh,
     root: int,
     scale: float,
@@ -188,21 +183,21 @@ def _cast_mesh(
 ) -> None:
     """Draw one mesh with the rays of a fisheye, one by one; the rest as of `_draw_mesh`."""
     # Ranges, as a cylinder's depths, are no depths along the optical axis: `met` is told by this.
-    own = View(view.focal, view.line_centre, view.pixel_centre, view.s_min * scale, True)
+    own = projection.View(view.focal, view.line_centre, view.pixel_centre, view.s_min * scale, True)
     per = 1.0 / scale
     box, c = bvh.boxes[root], pose.center
     half = (float(box[3]), float(box[4]), float(box[5]))
     middle = (c[0] + box[0], c[1] + box[1], c[2] + box[2])
-    at = Pose(pose.forward, pose.across, pose.along, middle)
-    part = fisheye_rectangle(out, own, bent, at, half, False)
+    at = projection.Pose(pose.forward, pose.across, pose.along, middle)
+    part = projection.fisheye_rectangle(out, own, bent, at, half, False)
     if drawn_in is not None:
         for side in range(4):
             drawn_in[side] = part[side]
     nowhere = (0.0, 0.0, 0.0)
     for v in range(part[0], part[1]):
         for u in range(part[2], part[3]):
-            ray = ray_of(pose, bent, v, u, nowhere, 0.0)
-            if dot(ray, ray) == 0.0:
+            ray = projection.ray_of(pose, bent, v, u, nowhere, 0.0)
+            if projection.dot(ray, ray) == 0.0:
                 # A pixel beyond the lens's circle.
                 continue
             _cast(out, ids, faces, number, v, u, ray, 0.0, own, pose, bvh, root, per, waiting, 0)
@@ -215,7 +210,7 @@ def _wait(
     at: int,
     node: int,
     near: float,
-    part: Rectangle,
+    part: projection.Rectangle,
 ) -> None:
     """Note a node, the least depth in it, and the rays that may hit it."""
     waiting[at, 0] = node
@@ -225,7 +220,7 @@ def _wait(
 
 
 @borrowing_kernel
-def _hidden(out: Image, part: Rectangle, greatest: float) -> bool:
+def _hidden(out: projection.Image, part: projection.Rectangle, greatest: float) -> bool:
     """Return whether all pixels of a small part see something nearer than an inverse depth."""
     if (part[1] - part[0]) * (part[3] - part[2]) > _MOST_LOOKED_AT:
         return False
@@ -238,7 +233,7 @@ def _hidden(out: Image, part: Rectangle, greatest: float) -> bool:
 
 @borrowing_kernel
 def _cast(
-    out: Image,
+    out: projection.Image,
     ids: Ids | None,
     faces: Faces | None,
     number: int,
@@ -246,8 +241,8 @@ def _cast(
     u: int,
     start: Vec,
     x: float,
-    view: View,
-    pose: Pose,
+    view: projection.View,
+    pose: projection.Pose,
     bvh: Bvh,
     root: int,
     per: float,

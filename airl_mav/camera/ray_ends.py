@@ -11,25 +11,9 @@ from numpy.typing import NDArray
 from airl_mav.arena.appearance import FLOOR as FLOOR_ROW
 from airl_mav.arena.appearance import OBSTACLE as OBSTACLE_ROW
 from airl_mav.arena.appearance import WALLS as WALLS_ROW
+from airl_mav.camera import patterns, primitives
 from airl_mav.camera.bvh import Meshes
 from airl_mav.camera.gloss import Gloss
-from airl_mav.camera.patterns import (
-    STEEP,
-    on_box,
-    on_cylinder,
-    on_sphere,
-    on_triangle,
-    periods_around,
-    texels2,
-)
-from airl_mav.camera.primitives import (
-    BOX,
-    CYLINDER,
-    FLOOR,
-    GROUND,
-    OBSTACLE,
-    WALL_NORTH_SOUTH,
-)
 from airl_mav.camera.projection import dot
 from airl_mav.camera.scene_rays import Bodies, Met, Place
 from airl_mav.camera.shading import F32, ZERO, Lit, Plane, surface_of, texel_at
@@ -41,9 +25,9 @@ from airl_mav.vehicle.rotation import Vec
 @kernel
 def row_of(seen: int) -> int:
     """Return the row of `Finish` of what is seen: neither ceiling nor sky."""
-    if seen >= OBSTACLE:
-        return OBSTACLE_ROW + seen - OBSTACLE
-    return FLOOR_ROW if seen in (FLOOR, GROUND) else WALLS_ROW
+    if seen >= primitives.OBSTACLE:
+        return OBSTACLE_ROW + seen - primitives.OBSTACLE
+    return FLOOR_ROW if seen in (primitives.FLOOR, primitives.GROUND) else WALLS_ROW
 
 
 class Look(NamedTuple):
@@ -80,25 +64,28 @@ def albedo_at(
     if met.mesh >= 0:
         if meshes is not None:
             n = meshes.bvh.normals[met.face]
-            across, along = on_triangle(a, b, c, n[0], n[1], n[2])
-    elif met.seen == FLOOR:
+            across, along = patterns.on_triangle(a, b, c, n[0], n[1], n[2])
+    elif met.seen == primitives.FLOOR:
         across, along = b, -a
-    elif met.seen < OBSTACLE:
-        across, along = (b if met.seen == WALL_NORTH_SOUTH else a), c
+    elif met.seen < primitives.OBSTACLE:
+        across, along = (b if met.seen == primitives.WALL_NORTH_SOUTH else a), c
     else:
-        shape, radius = bodies.shape[met.seen - OBSTACLE], bodies.half_size[met.seen - OBSTACLE, 0]
-        if shape == BOX:
-            across, along = on_box(a, b, c, place.side == 2, place.side == 0)
+        shape, radius = (
+            bodies.shape[met.seen - primitives.OBSTACLE],
+            bodies.half_size[met.seen - primitives.OBSTACLE, 0],
+        )
+        if shape == primitives.BOX:
+            across, along = patterns.on_box(a, b, c, place.side == 2, place.side == 0)
         else:
-            per_turn, in_periods = periods_around(radius, per_m), True
-            if shape == CYLINDER:
-                across, along = on_cylinder(a, b, c, place.side == 2, per_m, per_turn)
+            per_turn, in_periods = patterns.periods_around(radius, per_m), True
+            if shape == primitives.CYLINDER:
+                across, along = patterns.on_cylinder(a, b, c, place.side == 2, per_m, per_turn)
             else:
-                across, along = on_sphere(a, b, c, per_turn)
+                across, along = patterns.on_sphere(a, b, c, per_turn)
     if not in_periods:
         across, along = across * per_m, along * per_m
-    steep = max(F32(-dot(place.normal, ray)), STEEP)
-    texels = texels2(surface, pixel2) * F32(way) * F32(way) / steep
+    steep = max(F32(-dot(place.normal, ray)), patterns.STEEP)
+    texels = patterns.texels2(surface, pixel2) * F32(way) * F32(way) / steep
     at = texel_at(across + surface.offset[0], along + surface.offset[1], texels)
     red = look.atlas[np.uint64(surface.base + at)]
     green, blue = red, red

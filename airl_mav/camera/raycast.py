@@ -23,101 +23,82 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.camera import primitives, projection
 from airl_mav.camera.bvh import Meshes, is_owned, raised
 from airl_mav.camera.mesh_triangles import Faces
 from airl_mav.camera.meshes import draw_meshes
-from airl_mav.camera.primitives import (
-    BOX,
-    CYLINDER,
-    OBSTACLE,
-    TINY,
-    Ids,
-    Line,
-    Lines,
-    Rectangles,
-    draw_box,
-    draw_cylinder,
-    draw_room,
-    draw_sphere,
-    turned,
-)
-from airl_mav.camera.projection import (
-    MIN_DEPTH_M,
-    Bent,
-    Image,
-    Pose,
-    View,
-    cut,
-    cylinder_span,
-    fisheye_rectangle,
-    pinhole_rectangle,
-)
 from airl_mav.core.kernels import borrowing_kernel, kernel
 from airl_mav.vehicle.rotation import Quat, Vec, rotate
 
 
 @borrowing_kernel
 def _draw_obstacle(
-    out: Image,
-    ids: Ids | None,
-    drawn_in: Rectangles | None,
+    out: projection.Image,
+    ids: primitives.Ids | None,
+    drawn_in: primitives.Rectangles | None,
     number: int,
-    lines: Lines,
-    xs: Line,
-    bent: Bent | None,
-    view: View,
-    world: Pose,
+    lines: primitives.Lines,
+    xs: primitives.Line,
+    bent: projection.Bent | None,
+    view: projection.View,
+    world: projection.Pose,
     shape: int,
     half: Vec,
     yaw: float,
 ) -> bool:
     """Draw one obstacle whose centre is `world.center`; return whether the camera is inside."""
     cos, sin = 1.0, 0.0
-    if shape == BOX:
+    if shape == primitives.BOX:
         cos, sin = math.cos(yaw), math.sin(yaw)
-    elif shape == CYLINDER:
+    elif shape == primitives.CYLINDER:
         # Its bounding box turned towards the camera is the narrowest in the image.
         distance = math.hypot(world.center[0], world.center[1])
         if distance > 0.0:
             cos, sin = world.center[0] / distance, world.center[1] / distance
-    pose = turned(world, cos, sin)
-    sphere = shape != BOX and shape != CYLINDER
+    pose = primitives.turned(world, cos, sin)
+    sphere = shape != primitives.BOX and shape != primitives.CYLINDER
     turns = 0
     span = (0.0, 0.0, 0, 0)
     rectangle = (0, 0, 0, 0)
     if bent is not None:
-        rectangle = fisheye_rectangle(out, view, bent, pose, half, sphere)
+        rectangle = projection.fisheye_rectangle(out, view, bent, pose, half, sphere)
     elif view.cylindrical:
         # What is behind the camera may be at both ends of the image.
         turns = 1
-        span = cylinder_span(out, view, pose, half, sphere)
+        span = projection.cylinder_span(out, view, pose, half, sphere)
     else:
-        rectangle = pinhole_rectangle(out, view, pose, half, sphere)
+        rectangle = projection.pinhole_rectangle(out, view, pose, half, sphere)
     for turn in range(-turns, turns + 1):
         if view.cylindrical:
-            rectangle = cut(out, view, span, turn)
+            rectangle = projection.cut(out, view, span, turn)
         if drawn_in is not None:
             for side in range(4):
                 drawn_in[turn + turns, side] = rectangle[side]
         if rectangle[0] >= rectangle[1] or rectangle[2] >= rectangle[3]:
             continue
         inside: bool
-        if shape == BOX:
-            inside = draw_box(out, ids, number, lines, xs, bent, view, pose, half, rectangle)
-        elif shape == CYLINDER:
-            inside = draw_cylinder(out, ids, number, lines, xs, bent, view, pose, half, rectangle)
+        if shape == primitives.BOX:
+            inside = primitives.draw_box(
+                out, ids, number, lines, xs, bent, view, pose, half, rectangle
+            )
+        elif shape == primitives.CYLINDER:
+            inside = primitives.draw_cylinder(
+                out, ids, number, lines, xs, bent, view, pose, half, rectangle
+            )
         else:
-            inside = draw_sphere(out, ids, number, lines, xs, bent, view, pose, half[0], rectangle)
+            inside = primitives.draw_sphere(
+                out, ids, number, lines, xs, bent, view, pose, half[0], rectangle
+            )
         if inside:
             return True
     return False
 
 
 @borrowing_kernel
-def invert(out: Image) -> None:
+def invert(out: projection.Image) -> None:
     """Turn inverse depth into depth [m], in place."""
     zero, one = np.float32(0.0), np.float32(1.0)
-    least, most = np.float32(TINY), np.float32(1.0 / MIN_DEPTH_M)
+    least, most = np.float32(primitives.TINY), np.float32(1.0 / projection.MIN_DEPTH_M)
     for v in range(out.shape[0]):
         row = out[v]
         for u in range(len(row)):
@@ -127,7 +108,7 @@ def invert(out: Image) -> None:
 
 
 @borrowing_kernel
-def blank(out: Image, bent: Bent) -> None:
+def blank(out: projection.Image, bent: projection.Bent) -> None:
     """Write 0 where a fisheye's pixels see nothing at all."""
     for v in range(out.shape[0]):
         for u in range(out.shape[1]):
@@ -138,15 +119,15 @@ def blank(out: Image, bent: Bent) -> None:
 
 @borrowing_kernel
 def aim(
-    lines: Lines,
-    xs: Line,
+    lines: primitives.Lines,
+    xs: primitives.Line,
     quaternion: Quat | NDArray[np.float64],
     focal: float,
     cx: float,
     cy: float,
     cylindrical: bool,
     max_range: float,
-) -> tuple[View, Pose]:
+) -> tuple[projection.View, projection.Pose]:
     """Write the rays of an image's lines; return how it sees, and its axes about no centre.
 
     Args:
@@ -166,7 +147,7 @@ def aim(
         rotate(q, (0.0, 1.0, 0.0)),
         rotate(q, (0.0, 0.0, 1.0)),
     )
-    s_min = max(1.0 / max_range, TINY)
+    s_min = max(1.0 / max_range, primitives.TINY)
     nowhere = (0.0, 0.0, 0.0)
     if cylindrical:
         for u in range(len(lines)):
@@ -174,24 +155,28 @@ def aim(
             lines[u, 0], lines[u, 1] = math.cos(angle), math.sin(angle)
         for v in range(len(xs)):
             xs[v] = (v - cy) / focal
-        return View(focal, cx, cy, s_min, cylindrical), Pose(forward, right, down, nowhere)
+        return projection.View(focal, cx, cy, s_min, cylindrical), projection.Pose(
+            forward, right, down, nowhere
+        )
     for v in range(len(lines)):
         lines[v, 0], lines[v, 1] = 1.0, (v - cy) / focal
     for u in range(len(xs)):
         xs[u] = (u - cx) / focal
-    return View(focal, cy, cx, s_min, cylindrical), Pose(forward, down, right, nowhere)
+    return projection.View(focal, cy, cx, s_min, cylindrical), projection.Pose(
+        forward, down, right, nowhere
+    )
 
 
 @borrowing_kernel
 def draw_bodies(
-    out: Image,
-    ids: Ids | None,
-    drawn_in: Rectangles | None,
-    lines: Lines,
-    xs: Line,
-    bent: Bent | None,
-    view: View,
-    axes: Pose,
+    out: projection.Image,
+    ids: primitives.Ids | None,
+    drawn_in: primitives.Rectangles | None,
+    lines: primitives.Lines,
+    xs: primitives.Line,
+    bent: projection.Bent | None,
+    view: projection.View,
+    axes: projection.Pose,
     camera: Vec,
     bounds: NDArray[np.float64],
     shape: NDArray[np.int8],
@@ -230,16 +215,16 @@ def draw_bodies(
     half_room = (0.5 * (bounds[1] - bounds[0]), 0.5 * (bounds[3] - bounds[2]), 0.5 * bounds[4])
     forward, across, along = axes.forward, axes.across, axes.along
     closed = bounds[5] > 0.0
-    pose = Pose(forward, across, along, room)
-    draw_room(out, ids, lines, xs, bent, view, pose, half_room, closed)
+    pose = projection.Pose(forward, across, along, room)
+    primitives.draw_room(out, ids, lines, xs, bent, view, pose, half_room, closed)
     for i in range(len(shape)):
         if is_owned(meshes, i):
             continue
         offset = (center[i, 0] - camera[0], center[i, 1] - camera[1], center[i, 2] - camera[2])
         half = (half_size[i, 0], half_size[i, 1], half_size[i, 2])
-        pose = Pose(forward, across, along, offset)
+        pose = projection.Pose(forward, across, along, offset)
         kept = None if drawn_in is None else drawn_in[i]
-        number = OBSTACLE + i
+        number = primitives.OBSTACLE + i
         if _draw_obstacle(
             out, ids, kept, number, lines, xs, bent, view, pose, shape[i], half, yaw[i]
         ):
@@ -251,7 +236,7 @@ def draw_bodies(
 
 @kernel
 def render_depth(
-    out: Image,
+    out: projection.Image,
     position: Vec | NDArray[np.float64],
     quaternion: Quat | NDArray[np.float64],
     focal: float,
@@ -265,7 +250,7 @@ def render_depth(
     half_size: NDArray[np.float64],
     yaw: NDArray[np.float64],
     meshes: Meshes | None,
-    bent: Bent | None,
+    bent: projection.Bent | None,
 ) -> None:
     """Render the depth image of an arena.
 
@@ -308,7 +293,7 @@ def render_depth(
         yaw, meshes, None,
     )  # fmt: skip
     if inside >= 0:
-        out[:, :] = MIN_DEPTH_M
+        out[:, :] = projection.MIN_DEPTH_M
         if bent is not None:
             blank(out, bent)
         return

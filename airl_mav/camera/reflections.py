@@ -15,23 +15,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.camera import gloss, shading
 from airl_mav.camera.bvh import STACK, Meshes
-from airl_mav.camera.gloss import (
-    GLASS,
-    GLOSSY,
-    MATT,
-    METAL,
-    SAMPLES,
-    VARNISH_ADMITS,
-    facet,
-    facet_gives,
-    fresnel,
-    highlight,
-    is_smooth,
-    mirrored,
-    pane_reflects,
-    spread,
-)
 from airl_mav.camera.mesh_shadows import ABOVE_M
 from airl_mav.camera.primitives import CEILING, SKY, Ids
 from airl_mav.camera.projection import dot
@@ -43,16 +28,6 @@ from airl_mav.camera.scene_rays import (
     meet,
     place_of,
     sunlight,
-)
-from airl_mav.camera.shading import (
-    F32,
-    ZERO,
-    Lit,
-    Packed,
-    Rays,
-    Vec32,
-    irradiance,
-    packed,
 )
 from airl_mav.core.kernels import borrowing_kernel, kernel, large_borrowing_kernel, large_kernel
 from airl_mav.vehicle.rotation import Vec
@@ -95,9 +70,9 @@ class Seen(NamedTuple):
 
 @large_kernel
 def draw_reflections(
-    out: Packed,
+    out: shading.Packed,
     ids: Ids,
-    rays: Rays,
+    rays: shading.Rays,
     camera: Vec,
     bounds: NDArray[np.float64],
     shape: NDArray[np.int8],
@@ -116,15 +91,17 @@ def draw_reflections(
     colour, bodies = np.empty(3), bodies_of(bounds, shape, center, half_size, yaw)
     for u in range(len(out)):
         seen = ids[u]
-        if seen in (SKY, CEILING) or look.gloss.surface[row_of(seen)] == MATT:
+        if seen in (SKY, CEILING) or look.gloss.surface[row_of(seen)] == gloss.MATT:
             continue
         n, e, d = float(rays.north[u]), float(rays.east[u]), float(rays.down[u])
         per = 1.0 / math.sqrt(n * n + e * e + d * d)
         # By ways along oblique rays, where `Look.pixel2` is by depth.
-        pixel2 = F32(look.pixel2 * per * per * per)
+        pixel2 = shading.F32(look.pixel2 * per * per * per)
         _wait(tree, 0, camera, (per * n, per * e, per * d), (1.0, 1.0, 1.0), 0.0, 0, 0.0)
         _follow(colour, tree, nodes, bodies, meshes, look, pixel2)
-        out[u] = packed(F32(colour[0]), F32(colour[1]), F32(colour[2]))
+        out[u] = shading.packed(
+            shading.F32(colour[0]), shading.F32(colour[1]), shading.F32(colour[2])
+        )
 
 
 @borrowing_kernel
@@ -166,7 +143,7 @@ def _scaled(a: Vec, by: float) -> Vec:
 
 
 @borrowing_kernel
-def _add(colour: NDArray[np.float64], share: Vec, light: Vec | Vec32, by: float) -> None:
+def _add(colour: NDArray[np.float64], share: Vec, light: Vec | shading.Vec32, by: float) -> None:
     """Add a share of light, times a factor, to a colour (3,)."""
     for k in range(3):
         colour[k] += by * share[k] * light[k]
@@ -196,7 +173,7 @@ def _follow(
         if met.seen == SKY:
             _add(colour, share, sky_at(light, ray, origin[2]), 1.0)
             continue
-        if light.extinction > ZERO:
+        if light.extinction > shading.ZERO:
             clear = math.exp(-float(light.extinction) * met.distance)
             _add(colour, share, light.horizon, 1.0 - clear)
             share = _scaled(share, clear)
@@ -212,37 +189,37 @@ def _follow(
             ray, share, way, depth, advanced(origin, ray, met.distance), place.normal, albedo,
             min(max(-dot(place.normal, ray), 0.0), 1.0), float(look.gloss.alpha[row]), blur,
         )  # fmt: skip
-        if kind == GLASS:
+        if kind == gloss.GLASS:
             tops = _pass(tree, tops, seen)
             continue
         arrives = 0.0
         if _shines(light) and dot(seen.normal, _sun(light)) > 0.0:
             begin = advanced(seen.at, seen.normal, ABOVE_M) if met.mesh >= 0 else seen.at
             arrives = sunlight(bodies, meshes, look.gloss.lets, met.seen, begin, _sun(light), nodes)
-        if kind != METAL:
+        if kind != gloss.METAL:
             _scatter(colour, seen, kind, light, arrives)
-        if kind != MATT:
+        if kind != gloss.MATT:
             _shine(colour, seen, kind, light, arrives)
             tops = _mirror(tree, tops, seen, kind)
 
 
 @kernel
-def _sun(light: Lit) -> Vec:
+def _sun(light: shading.Lit) -> Vec:
     """Return the unit vector towards the sun."""
     return (float(light.to_sun[0]), float(light.to_sun[1]), float(light.to_sun[2]))
 
 
 @kernel
-def _shines(light: Lit) -> bool:
+def _shines(light: shading.Lit) -> bool:
     """Return whether the sun does."""
-    return bool(max(max(light.sun[0], light.sun[1]), light.sun[2]) > ZERO)
+    return bool(max(max(light.sun[0], light.sun[1]), light.sun[2]) > shading.ZERO)
 
 
 @large_borrowing_kernel
 def _pass(tree: NDArray[np.float64], tops: int, seen: Seen) -> int:
     """Go on through a pane and back from it; return how many rays wait."""
-    back = pane_reflects(seen.cosine)
-    away = mirrored(seen.ray, seen.normal)
+    back = gloss.pane_reflects(seen.cosine)
+    away = gloss.mirrored(seen.ray, seen.normal)
     tops = _grown(tree, tops, seen, away, _scaled(seen.share, back), 0.0)
     onwards = _times(_scaled(seen.share, 1.0 - back), seen.albedo)
     return _grown(tree, tops, seen, seen.ray, onwards, 0.0)
@@ -250,53 +227,55 @@ def _pass(tree: NDArray[np.float64], tops: int, seen: Seen) -> int:
 
 @large_borrowing_kernel
 def _scatter(
-    colour: NDArray[np.float64], seen: Seen, kind: int, light: Lit, arrives: float
+    colour: NDArray[np.float64], seen: Seen, kind: int, light: shading.Lit, arrives: float
 ) -> None:
     """Add the matt scattering of a bare or varnished surface; `arrives` = share of sunlight."""
     facing, enters, sun_enters = max(dot(seen.normal, _sun(light)), 0.0), 1.0, 1.0
-    if kind == GLOSSY:
+    if kind == gloss.GLOSSY:
         # Light from all sides that the varnish lets in, is scattered below it, thrown back by the
         # varnish, scattered again, is in the end as bright as without any; so the sun's is set
         # against the mean of all sides, and what comes out to the eye is what enters from there.
-        enters = 1.0 - fresnel(seen.cosine)
-        sun_enters = (1.0 - fresnel(min(facing, 1.0))) / VARNISH_ADMITS
-    direct, rise = F32(arrives * facing * sun_enters), F32(-seen.normal[2])
+        enters = 1.0 - gloss.fresnel(seen.cosine)
+        sun_enters = (1.0 - gloss.fresnel(min(facing, 1.0))) / gloss.VARNISH_ADMITS
+    direct, rise = shading.F32(arrives * facing * sun_enters), shading.F32(-seen.normal[2])
     for k in range(3):
-        bright = irradiance(light, k, direct, rise)
+        bright = shading.irradiance(light, k, direct, rise)
         colour[k] += seen.share[k] * enters * seen.albedo[k] * bright
 
 
 @large_borrowing_kernel
-def _shine(colour: NDArray[np.float64], seen: Seen, kind: int, light: Lit, arrives: float) -> None:
+def _shine(
+    colour: NDArray[np.float64], seen: Seen, kind: int, light: shading.Lit, arrives: float
+) -> None:
     """Add the sun's highlight on a rough surface; mirrors show the sun itself.
 
     A mirrored highlight is widened by the mirror's roughness, since eight rays would show it eight
     times (Kaplanyan and Dachsbacher, Path space regularization, 2013).
     """
-    if arrives == 0.0 or is_smooth(seen.alpha):
+    if arrives == 0.0 or gloss.is_smooth(seen.alpha):
         return
     alpha = max(seen.alpha, seen.blur)
-    value, cosine = highlight(alpha, seen.normal, seen.ray, _sun(light))
-    if kind == METAL:
+    value, cosine = gloss.highlight(alpha, seen.normal, seen.ray, _sun(light))
+    if kind == gloss.METAL:
         _add(colour, _times(seen.share, seen.albedo), light.sun, arrives * value)
     else:
-        back = fresnel(min(max(cosine, 0.0), 1.0))
+        back = gloss.fresnel(min(max(cosine, 0.0), 1.0))
         _add(colour, seen.share, light.sun, arrives * value * back)
 
 
 @large_borrowing_kernel
 def _mirror(tree: NDArray[np.float64], tops: int, seen: Seen, kind: int) -> int:
     """Go on where metal or varnish mirrors; return how many rays wait."""
-    many = 1 if seen.depth > 0 or is_smooth(seen.alpha) else SAMPLES
+    many = 1 if seen.depth > 0 or gloss.is_smooth(seen.alpha) else gloss.SAMPLES
     for number in range(many):
-        u, v = spread(number)
-        shine = seen.normal if many == 1 else facet(seen.alpha, seen.normal, seen.ray, u, v)
-        away = mirrored(seen.ray, shine)
-        gives = 1.0 if many == 1 else facet_gives(seen.alpha, seen.normal, away) / many
+        u, v = gloss.spread(number)
+        shine = seen.normal if many == 1 else gloss.facet(seen.alpha, seen.normal, seen.ray, u, v)
+        away = gloss.mirrored(seen.ray, shine)
+        gives = 1.0 if many == 1 else gloss.facet_gives(seen.alpha, seen.normal, away) / many
         share = _scaled(seen.share, gives)
-        if kind == METAL:
+        if kind == gloss.METAL:
             share = _times(share, seen.albedo)
         else:
-            share = _scaled(share, fresnel(min(max(-dot(shine, seen.ray), 0.0), 1.0)))
+            share = _scaled(share, gloss.fresnel(min(max(-dot(shine, seen.ray), 0.0), 1.0)))
         tops = _grown(tree, tops, seen, away, share, 0.0 if many == 1 else seen.alpha)
     return tops

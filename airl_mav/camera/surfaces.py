@@ -12,28 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.camera.patterns import (
-    STEEP,
-    on_box,
-    on_cylinder,
-    on_sphere,
-    periods_around,
-    texels2,
-)
-from airl_mav.camera.primitives import (
-    BOX,
-    CEILING,
-    CYLINDER,
-    FLOOR,
-    OBSTACLE,
-    SKY,
-    WALL_EAST_WEST,
-    WALL_NORTH_SOUTH,
-    Ids,
-    Line,
-    Lines,
-    turned,
-)
+from airl_mav.camera import patterns, primitives
 from airl_mav.camera.projection import MIN_DEPTH_M, Bent, Pose
 from airl_mav.camera.shading import (
     F32,
@@ -64,7 +43,7 @@ FOG_LAYER_M: Final = 100.0
 
 @borrowing_kernel
 def span_of(
-    ids: Ids, low: int, high: int, left: int, end: int, first: np.int32, last: np.int32
+    ids: primitives.Ids, low: int, high: int, left: int, end: int, first: np.int32, last: np.int32
 ) -> tuple[int, int]:
     """Return the part of left..end that sees surfaces first..last, in whole vectors."""
     seen, length = ids[left:end], I32(end - left)
@@ -80,7 +59,9 @@ def span_of(
 
 
 @borrowing_kernel
-def write_rays(rays: Rays, lines: Lines, xs: Line, bent: Bent | None, axes: Pose) -> None:
+def write_rays(
+    rays: Rays, lines: primitives.Lines, xs: primitives.Line, bent: Bent | None, axes: Pose
+) -> None:
     """Write the ray of every pixel of an image's lines."""
     r = along32(axes)
     n = len(xs)
@@ -96,12 +77,16 @@ def write_rays(rays: Rays, lines: Lines, xs: Line, bent: Bent | None, axes: Pose
 
 
 @borrowing_kernel
-def draw_sky(out: Packed, ids: Ids, points: Points, rays: Rays, camera: Vec, light: Lit) -> None:
+def draw_sky(
+    out: Packed, ids: primitives.Ids, points: Points, rays: Rays, camera: Vec, light: Lit
+) -> None:
     """Write sky and, below the horizon, ground as bright as the mean floor; or the ceiling."""
     above = F32(max(-camera[2], MIN_DEPTH_M))
     zenith, horizon, ground = light.zenith, light.horizon, light.ground
     rises, clear = points.up, points.pattern
-    begin, stop = span_of(ids, 0, len(ids), 0, len(ids), I32(CEILING), I32(SKY))
+    begin, stop = span_of(
+        ids, 0, len(ids), 0, len(ids), I32(primitives.CEILING), I32(primitives.SKY)
+    )
     for left in range(begin, stop, BLOCK):
         end = min(left + BLOCK, stop)
         row, norths, easts, downs = (
@@ -133,7 +118,7 @@ def draw_sky(out: Packed, ids: Ids, points: Points, rays: Rays, camera: Vec, lig
 @borrowing_kernel
 def shade_floor(
     out: Packed,
-    ids: Ids,
+    ids: primitives.Ids,
     far: Plane,
     lit: Plane,
     clear: Plane,
@@ -149,8 +134,8 @@ def shade_floor(
     at0, at1 = F32(camera[0]), F32(camera[1])
     sun_up = -light.to_sun[2]
     # The camera's height is t times the ray's slope.
-    texel = texels2(floor, pixel2) / F32(max(-camera[2], MIN_DEPTH_M))
-    own = I32(FLOOR)
+    texel = patterns.texels2(floor, pixel2) / F32(max(-camera[2], MIN_DEPTH_M))
+    own = I32(primitives.FLOOR)
     begin, stop = span_of(ids, 0, len(ids), 0, len(ids), own, own)
     for left in range(begin, stop, BLOCK):
         end = min(left + BLOCK, stop)
@@ -168,7 +153,7 @@ def shade_floor(
 @borrowing_kernel
 def shade_walls(
     out: Packed,
-    ids: Ids,
+    ids: primitives.Ids,
     far: Plane,
     lit: Plane,
     clear: Plane,
@@ -183,8 +168,8 @@ def shade_walls(
     """Shade the walls. Their pattern begins at the foot, north and east of the start."""
     at0, at1, at2 = F32(camera[0]), F32(camera[1]), F32(camera[2])
     sun0, sun1 = light.to_sun[0], light.to_sun[1]
-    texel = texels2(walls, pixel2)
-    first, last = I32(WALL_NORTH_SOUTH), I32(WALL_EAST_WEST)
+    texel = patterns.texels2(walls, pixel2)
+    first, last = I32(primitives.WALL_NORTH_SOUTH), I32(primitives.WALL_EAST_WEST)
     begin, stop = span_of(ids, 0, len(ids), 0, len(ids), first, last)
     for left in range(begin, stop, BLOCK):
         end = min(left + BLOCK, stop)
@@ -197,7 +182,7 @@ def shade_walls(
             to_sun = -to_sun if normal > ZERO else to_sun
             across = (at1 + t * e if north else at0 + t * n) * walls.per_m + walls.offset[0]
             along = (at2 + t * d) * walls.per_m + walls.offset[1]
-            texels = texel * t * t / max(abs(normal), STEEP)
+            texels = texel * t * t / max(abs(normal), patterns.STEEP)
             points.place[u] = texel_at(across, along, texels)
             points.facing[u] = max(to_sun, ZERO)
             points.up[u] = ZERO
@@ -207,15 +192,15 @@ def shade_walls(
 @borrowing_kernel
 def shade_obstacle(
     out: Packed,
-    ids: Ids,
+    ids: primitives.Ids,
     far: Plane,
     lit: Plane,
     clear: Plane,
     points: Points,
     rectangle: NDArray[np.int32],
     number: int,
-    lines: Lines,
-    xs: Line,
+    lines: primitives.Lines,
+    xs: primitives.Line,
     bent: Bent | None,
     world: Pose,
     shape: int,
@@ -231,19 +216,19 @@ def shade_obstacle(
     A box's pattern begins in the middle of each face. A cylinder's goes round it in a whole number
     of periods, a sphere's by longitude and latitude.
     """
-    cos, sin = (math.cos(yaw), math.sin(yaw)) if shape == BOX else (1.0, 0.0)
-    pose = turned(world, cos, sin)
+    cos, sin = (math.cos(yaw), math.sin(yaw)) if shape == primitives.BOX else (1.0, 0.0)
+    pose = primitives.turned(world, cos, sin)
     c0, c1, c2 = F32(pose.center[0]), F32(pose.center[1]), F32(pose.center[2])
     r = along32(pose)
     s0 = F32(cos * light.to_sun[0] + sin * light.to_sun[1])
     s1 = F32(cos * light.to_sun[1] - sin * light.to_sun[0])
     s2 = light.to_sun[2]
     per0, per1, per2 = F32(1.0 / half[0]), F32(1.0 / half[1]), F32(1.0 / half[2])
-    texel, radius = texels2(surface, pixel2), F32(half[0])
+    texel, radius = patterns.texels2(surface, pixel2), F32(half[0])
     per_m, begin_u, begin_v = surface.per_m, surface.offset[0], surface.offset[1]
-    per_turn = periods_around(half[0], per_m)
+    per_turn = patterns.periods_around(half[0], per_m)
     place, facing, ups = points.place, points.facing, points.up
-    own = I32(OBSTACLE + number)
+    own = I32(primitives.OBSTACLE + number)
     for v in range(rectangle[0], rectangle[1]):
         line = v * len(xs)
         low, high = line + rectangle[2], line + rectangle[3]
@@ -252,7 +237,7 @@ def shade_obstacle(
             continue
         x_row, far_row = xs[left - line : end - line], far[left:end]
         start, first = start32(pose, lines[v, 0], lines[v, 1]), left - line
-        if shape == BOX:
+        if shape == primitives.BOX:
             for u in range(end - left):
                 t = far_row[u]
                 n, e, d = ray32(pose, r, bent, v, first + u, start, F32(x_row[u]))
@@ -265,12 +250,12 @@ def shade_obstacle(
                 to_sun = s2 if on_c else (s0 if on_a else s1)
                 to_sun = to_sun if outward > ZERO else -to_sun
                 up = ONE if c < ZERO else -ONE
-                across, along = on_box(a, b, c, on_c, on_a)
-                texels = texel * t * t / max(abs(normal), STEEP)
+                across, along = patterns.on_box(a, b, c, on_c, on_a)
+                texels = texel * t * t / max(abs(normal), patterns.STEEP)
                 place[u] = texel_at(across * per_m + begin_u, along * per_m + begin_v, texels)
                 facing[u] = max(to_sun, ZERO)
                 ups[u] = up if on_c else ZERO
-        elif shape == CYLINDER:
+        elif shape == primitives.CYLINDER:
             for u in range(end - left):
                 t = far_row[u]
                 n, e, d = ray32(pose, r, bent, v, first + u, start, F32(x_row[u]))
@@ -280,8 +265,8 @@ def shade_obstacle(
                 vertical = s2 if c > ZERO else -s2
                 to_sun = vertical if cap else (a * s0 + b * s1) * per0
                 up = ONE if c < ZERO else -ONE
-                across, along = on_cylinder(a, b, c, cap, per_m, per_turn)
-                texels = texel * t * t / max(abs(normal), STEEP)
+                across, along = patterns.on_cylinder(a, b, c, cap, per_m, per_turn)
+                texels = texel * t * t / max(abs(normal), patterns.STEEP)
                 place[u] = texel_at(across + begin_u, along + begin_v, texels)
                 facing[u] = max(to_sun, ZERO)
                 ups[u] = up if cap else ZERO
@@ -292,8 +277,8 @@ def shade_obstacle(
                 a, b, c = t * n - c0, t * e - c1, t * d - c2
                 normal = (a * n + b * e + c * d) * per0
                 to_sun = (a * s0 + b * s1 + c * s2) * per0
-                across, along = on_sphere(a, b, c, per_turn)
-                texels = texel * t * t / max(abs(normal), STEEP)
+                across, along = patterns.on_sphere(a, b, c, per_turn)
+                texels = texel * t * t / max(abs(normal), patterns.STEEP)
                 place[u] = texel_at(across + begin_u, along + begin_v, texels)
                 facing[u] = max(to_sun, ZERO)
                 ups[u] = min(max(-c * per0, -ONE), ONE)
