@@ -59,13 +59,9 @@ def obstacle_distance(
 ) -> dict[str, Any]:
     """Return the fields of the message.
 
-    Args:
-        depth_mm: Depth image (h, w) [mm], 0 = no return.
-        camera: Its intrinsics.
-        range_m: Its range [m].
-        quaternion: Attitude of the vehicle (4,), body to NED.
-        pitch_up_rad: Pitch of the camera mount, up [rad].
-        now_us: Time since the program started [µs].
+    `depth_mm` (h, w) is a depth image, 0 = no return, up to `range_m` [m], `quaternion` (4,) the
+    vehicle's attitude, body to NED, `pitch_up_rad` that of the mount, `now_us` the time since the
+    start.
     """
     fov_rad = camera.horizontal_fov_rad
     count = min(BINS, max(1, int(fov_rad / BIN_RAD + 1e-6)))

@@ -37,13 +37,10 @@ class Sender(Protocol):
 def computer_status(
     now_us: int, cores_percent: Sequence[float], ram_bytes: tuple[int, int], celsius: float | None
 ) -> dict[str, Any]:
-    """Return the fields of the message.
+    """Return the fields of the message at a time since the start [µs].
 
-    Args:
-        now_us: Time since the program started [µs].
-        cores_percent: Load of each core, 0 to 100 since the last message; the first 8 count.
-        ram_bytes: Memory in use, and all.
-        celsius: Of the processor [°C]; None: not known.
+    `cores_percent` are the loads since the last message, of which the first 8 count, `ram_bytes`
+    memory in use and all, `celsius` is that of the processor, if known.
     """
     cores = [round(percent) for percent in cores_percent[:CORES]]
     temperature = NO_TEMPERATURE if celsius is None else max(-128, min(126, round(celsius)))

@@ -66,13 +66,9 @@ def _first_free(
 ) -> bool:
     """Write the first point of a rectangle that is in no box; return whether there is one.
 
-    Args:
-        numbers: (k, 2) uniform in [0, 1): relative positions of the points.
-        lowest: (2,) south-west corner of the rectangle [m].
-        span: (2,) its sides [m].
-        center: (m, 2) centres of the boxes [m].
-        grown: (m, 2) their half extents [m].
-        place: (2,) north, east [m]; written.
+    The rectangle has the south-west corner `lowest` and the sides `span` (2,) [m], in which
+    `numbers` (k, 2) in [0, 1) are the points; the boxes have `center` and half extents `grown` (m,
+    2) [m].
     """
     for number in numbers:
         for axis in range(2):
@@ -123,16 +119,9 @@ def _place_all(
 ) -> tuple[int, int, int]:
     """Place boxes one by one, into the last rows of `center`, while there are numbers.
 
-    Args:
-        batches: (k, BATCH, 2) uniform in [0, 1), for one try of a box each.
-        halves: As of `place_all`, as is `gap_m`.
-        center: Centres of the boxes to avoid, and of the placed ones [m].
-        half: Half extents of these, any clearance already added [m].
-        low: As of `draw_place`, as is `high`.
-        high: See there.
-        gap_m: See there.
-        placed: Number of placed boxes.
-        tried: Number of batches that the next one has tried.
+    `batches` (k, BATCH, 2) in [0, 1) are for one try of a box each. `center` and `half` are the
+    boxes to avoid, any clearance added, and the placed ones [m]. `placed` boxes have a place, the
+    next one has tried `tried` batches; the rest as of `place_all` and `draw_place`.
 
     Returns:
         New `placed` and `tried`, at most BATCHES, and the number of used batches.

@@ -222,17 +222,8 @@ def _in_middle(
 ) -> float:
     """Return a triangle's maximum height on the disc's edge, or `best`.
 
-    Args:
-        s: Distance from the disc's middle to its cell's south-west corner, south [m].
-        w: The same to the east.
-        low: Height of that corner [m].
-        up: Slope to the north.
-        across: Slope to the east.
-        step_n: Side of the cell to the north [m].
-        step_e: Side to the east [m].
-        north_west: Which of the cell's triangles.
-        radius: Of the disc [m].
-        best: Maximum height so far [m].
+    `s` and `w` are the distances [m] from the disc's middle to the south-west corner of its cell,
+    of height `low` and sides `step_n`, `step_e`; `up` and `across` are the slopes north and east.
     """
     steep = math.sqrt(up * up + across * across)
     x, y = 0.0, 0.0

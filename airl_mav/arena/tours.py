@@ -45,14 +45,8 @@ def draw_tours(
 ) -> list[Tour]:
     """Draw closed tours, clear of each other at time 0; fewer where one finds no place.
 
-    Args:
-        rng: Generator.
-        halves: (n, 2) half extents of their bounding boxes [m].
-        keep_off: Boxes to avoid at time 0, any clearance already added.
-        walls: Boxes to avoid on the way, likewise.
-        bounds: The walls of the room.
-        gap_m: Minimum gap between two of them at time 0 [m].
-        kind: Speed range, leg length, dwell, minimum duration, clearance on the way.
+    `halves` (n, 2) are half extents [m]. `keep_off` are boxes to avoid at time 0, `walls` on the
+    way, any clearance included, `gap_m` is the minimum gap at time 0 [m].
     """
     boxes = with_room(keep_off, halves + gap_m)
     low, high = inner(bounds, 0.0)
@@ -227,12 +221,8 @@ def _timed(
 ) -> tuple[Floats, Floats, NDArray[np.int64]]:
     """Return times [s] and places [m] of tours at constant speeds, and where each ends.
 
-    Args:
-        points: (k, 2) way-points of all tours, one tour after the other [m].
-        counts: (m,) number of each.
-        speeds: (m,) of each [m/s].
-        legs: (k - 1,) distance from each point to the next [m].
-        dwell_s: Duration of a stop at each point but the first.
+    `points` (k, 2) are the way-points of all tours [m], `counts` (m,) their numbers, `speeds` (m,)
+    [m/s], `legs` (k - 1,) the distances [m]; a stop at each point but the first takes `dwell_s`.
     """
     stops = 1 if dwell_s > 0.0 else 0
     times, places = np.empty(len(points) * (1 + stops)), np.empty((len(points) * (1 + stops), 2))

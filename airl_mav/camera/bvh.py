@@ -87,14 +87,10 @@ def _build(
     bounds: NDArray[np.float64],
     links: NDArray[np.int32],
 ) -> int:
-    """Write the tree over m boxes; return its number of nodes.
+    """Write the tree over m boxes, `low` and `high` (m, 3); return its number of nodes.
 
-    Args:
-        low: (m, 3) lowest corners of the boxes.
-        high: (m, 3) highest.
-        order: (m,) their numbers, sorted by leaf.
-        bounds: (2 m - 1, 6) written: lowest and highest corner of each node.
-        links: (2 m - 1, 2) written, as of `Bvh`.
+    `order` (m,) are the boxes' numbers, sorted by leaf; written are `bounds` (2 m - 1, 6), lowest
+    and highest corner of each node, and `links` (2 m - 1, 2), as of `Bvh`.
     """
     waiting = np.empty((STACK + 1, 4), np.int64)  # begin, end, parent of a right child, level
     waiting[0] = (0, len(order), -1, 0)

@@ -79,15 +79,9 @@ def expose(
     position: Vec | NDArray[np.float64],
     quaternion: Quat | NDArray[np.float64],
 ) -> NDArray[Any]:
-    """Return the image that a camera takes of an arena, as in `Frame.image`.
+    """Return the image that a camera takes of an arena, as in `Frame.image`; see `render.render`.
 
-    Args:
-        arena: The arena.
-        centers: (n, 3) present obstacle centres NED [m], as of `Arena.centers_at`.
-        intrinsics: The camera.
-        max_range: Maximum depth [m]; unlimited for colour.
-        position: (3,) camera NED [m].
-        quaternion: (4,) unit [w, x, y, z] camera -> NED; its x axis is the optical axis.
+    Colour has no maximum depth.
     """
     if intrinsics.kind == "depth":
         return depth_to_z16(render(arena, centers, intrinsics, max_range, position, quaternion))

@@ -41,14 +41,10 @@ def draw_drops(
     drops: NDArray[np.float32],
     light_of: NDArray[np.float32],
 ) -> None:
-    """Draw drops into an image.
+    """Draw drops into an image `rgb` (h, w, 3) sRGB; `dry` is a buffer of its size.
 
-    Args:
-        rgb: (h, w, 3) sRGB, changed.
-        dry: (h, w, 3) buffer.
-        drops: (k, 4) middle in widths and heights of the image from left and top, width in image
-            widths, height in drop widths.
-        light_of: (256,) `image_sensor.LIGHT_OF`.
+    `drops` (k, 4): middle in widths and heights of the image from left and top, width in image
+    widths, height in drop widths. `light_of` is `image_sensor.LIGHT_OF`.
     """
     height, width, _ = rgb.shape
     dry[:, :, :] = rgb

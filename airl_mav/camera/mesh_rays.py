@@ -40,17 +40,10 @@ def stopped_by(
     last: int,
     waiting: NDArray[np.int32],
 ) -> int:
-    """Return a triangle between a point and the sun; -1 = none. Units are the mesh's.
+    """Return a triangle beyond `least` between a point and the sun; -1 = none.
 
-    Args:
-        bvh: The trees.
-        root: The mesh's.
-        at: (3,) the point, from the mesh's origin.
-        sun: (3,) unit vector.
-        inverse: (3,) one over each of its components.
-        least: Minimum distance.
-        last: Triangle that hid the previous point, tested first.
-        waiting: (STACK,) buffer.
+    Arguments as of `distance_to`; `inverse` (3,) is one over `sun`, and `last` the triangle that
+    hid the previous point, tested first.
     """
     if last >= 0 and _stops(bvh.corners, last, at, sun, least):
         return last
@@ -85,16 +78,9 @@ def distance_to(
     most: float,
     waiting: NDArray[np.int32],
 ) -> tuple[float, int]:
-    """Return distance and triangle of a ray's first hit; -1 = none. Units are the mesh's.
+    """Return distance and triangle of a ray's first hit in `least`..`most`; -1 = none.
 
-    Args:
-        bvh: The trees.
-        root: The mesh's.
-        at: (3,) where the ray begins, from the mesh's origin.
-        way: (3,) its direction.
-        least: Minimum distance.
-        most: Maximum distance.
-        waiting: (STACK,) buffer.
+    Distances are in units of the mesh, `at` (3,) from its origin; `waiting` (STACK,) is a buffer.
     """
     inverse = (inverse_of(way[0]), inverse_of(way[1]), inverse_of(way[2]))
     boxes, links = bvh.boxes, bvh.links

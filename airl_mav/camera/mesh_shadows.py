@@ -48,21 +48,8 @@ def shade_by_meshes(
 ) -> None:
     """Put the points that meshes hide from the sun into shadow.
 
-    Args:
-        lit: (n, m) changed: 0 in shadow.
-        far: (n, m) depth [m].
-        ids: (n, m) what is seen.
-        faces: (n, m) the meshes' triangles.
-        corners: (CORNERS, 3) buffer.
-        lines: Of the image, as are `xs` and `bent`.
-        xs: Rays of a line.
-        bent: A fisheye's rays instead of both; None: another projection.
-        view: The projection.
-        axes: The camera's axes.
-        camera: (3,) NED [m].
-        meshes: The arena's meshes.
-        to_sun: (3,) unit vector NED.
-        gloss: Transmission of the surfaces; None: opaque.
+    `gloss` has the surfaces' transmission; None: opaque. `faces` (n, m) are the meshes' visible
+    triangles; the rest as of `shadows.shade_by_obstacle`.
     """
     waiting, maybe = np.empty(STACK, np.int32), np.empty(len(xs), np.bool_)
     for k in range(len(meshes.root)):

@@ -43,28 +43,10 @@ def shade_meshes(
 ) -> None:
     """Shade the visible flat triangles of meshes, with a pattern along the nearest mesh axis.
 
-    Args:
-        out: (n,) packed colours, written.
-        ids: (n,) what is seen.
-        far: (n,) depth [m].
-        lit: (n,) 1 in the sun, 0 in shadow.
-        clear: (n,) transmission of the fog.
-        points: Buffer.
-        rectangles: (obstacles + meshes, 3, 4) pixels of each mesh, in its first place.
-        meshes: The arena's meshes.
-        faces: (n,) the visible triangle.
-        lines: Of the image, as are `xs` and `bent`.
-        xs: Rays of a line.
-        bent: A fisheye's rays instead of both; None: another projection.
-        axes: The camera's axes.
-        camera: (3,) NED [m].
-        texture: As of `colour.render_colour`, with the next three.
-        per_m: Periods of the pattern per metre.
-        offset: Origin of the pattern.
-        albedo: Both ends of the pattern.
-        light: The light.
-        atlas: `textures.atlas()`.
-        pixel2: Square of the side of a pixel at a depth of 1.
+    `out` (n,) packed colours are written. `far`, `lit`, `clear`, `points`, `light` and `atlas` are
+    as of `shading.paint`, `rectangles`, `faces`, `lines`, `xs`, `bent`, `axes` and `camera` as of
+    `raycast.draw_bodies`, the materials as of `colour.render_colour`; `pixel2` is the square of the
+    side of a pixel at a depth of 1.
     """
     for k in range(len(meshes.first)):
         rectangle = rectangles[len(meshes.owner) + k, 0]

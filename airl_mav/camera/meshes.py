@@ -58,21 +58,10 @@ def draw_meshes(
     camera: Vec,
     meshes: Meshes,
 ) -> None:
-    """Draw the meshes of an arena over what has been drawn.
+    """Draw the meshes of an arena over what has been drawn; arguments as of `raycast.draw_bodies`.
 
-    Args:
-        out: (n, m) inverse depth [1/m], changed.
-        ids: (n, m) what each pixel sees, changed; None = not needed.
-        faces: (n, m) visible triangles, written; None as `ids`.
-        drawn_in: (obstacles + meshes, 3, 4) rectangle of each mesh, written behind the obstacles in
-            its first place; None as `ids`.
-        lines: Of the image, as are `xs` and `bent`.
-        xs: Rays of a line.
-        bent: A fisheye's rays instead of both; None: another projection.
-        view: The projection.
-        axes: The camera's axes.
-        camera: (3,) NED [m].
-        meshes: The arena's meshes.
+    `ids`, `faces` and `drawn_in` are None together; `drawn_in` is written behind the obstacles, in
+    the first place of each mesh.
     """
     waiting = np.empty((STACK, 5), np.int32)
     nearest = np.empty(STACK)

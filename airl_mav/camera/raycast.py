@@ -130,16 +130,8 @@ def aim(
 ) -> tuple[projection.View, projection.Pose]:
     """Write the rays of an image's lines; return how it sees, and its axes about no centre.
 
-    Args:
-        lines: (n, 2) written: parts of the forward axis and of the axis across in each line's first
-            ray.
-        xs: (m,) written: part of the axis along in each ray of a line.
-        quaternion: As of `render_depth`, with the others.
-        focal: Focal length.
-        cx: Column of the optical axis.
-        cy: Row of the optical axis.
-        cylindrical: The image is a cylinder's.
-        max_range: Maximum depth [m].
+    `lines` (n, 2) gets the parts of the forward axis and of the axis across in each line's first
+    ray, `xs` (m,) the part of the axis along in each ray; the rest as of `render_depth`.
     """
     q = (quaternion[0], quaternion[1], quaternion[2], quaternion[3])
     forward, right, down = (
@@ -188,24 +180,11 @@ def draw_bodies(
 ) -> int:
     """Write the inverse depth of an arena; return the obstacle around the camera, or -1.
 
-    Args:
-        out: (n, m) inverse depth [1/m], written; 0 = no return.
-        ids: (n, m) written: CEILING, SKY, ..., OBSTACLE + number, or GROUND for hills; None = not
-            needed, at no cost.
-        drawn_in: (obstacles + meshes, 3, 4) written: their rectangles; None = not needed.
-        lines: Of `aim`, with the next three.
-        xs: Rays of a line.
-        bent: A fisheye's rays instead of both; None: another projection.
-        view: The projection.
-        axes: The camera's axes.
-        camera: (3,) NED [m], above the floor.
-        bounds: As of `render_depth`, with the rest.
-        shape: (n,).
-        center: (n, 3).
-        half_size: (n, 3).
-        yaw: (n,).
-        meshes: As of `render_depth`.
-        faces: (n, m) written: visible triangles of meshes; None = not needed.
+    Args not listed are those of `render_depth`. `out` (n, m) is inverse depth [1/m], 0 = no return.
+    `ids` (n, m) is CEILING, SKY, ..., OBSTACLE + number, or GROUND for hills, `drawn_in` (obstacles
+    + meshes, 3, 4) the rectangles of bodies, `faces` (n, m) the visible triangles of meshes; these
+    three are written unless None. `lines`, `xs`, `view` and `axes` are those of `aim`, `bent` a
+    fisheye's rays or None, `camera` (3,) NED [m], above the floor.
     """
     room = (
         0.5 * (bounds[0] + bounds[1]) - camera[0],

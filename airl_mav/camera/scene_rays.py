@@ -266,16 +266,10 @@ def sunlight(
     to_sun: Vec,
     waiting: NDArray[np.int32],
 ) -> float:
-    """Return the share of the sun's light that reaches a point.
+    """Return the share of the sun's light that reaches a point slightly off its surface.
 
-    Args:
-        bodies: Obstacles and room.
-        meshes: Visible meshes; None: none.
-        lets: (2 + n,) transmission of each surface, `Gloss.lets`.
-        own: Surface of the point, as `Met.seen`: a convex body shades itself.
-        at: (3,) the point, slightly off a mesh's surface, NED [m].
-        to_sun: (3,) unit vector NED.
-        waiting: (STACK,) buffer.
+    `lets` (2 + n,) is `Gloss.lets`, `own` the point's surface, as `Met.seen`: a convex body shades
+    itself; `waiting` (STACK,) is a buffer.
     """
     share = 1.0
     bounds = bodies.bounds

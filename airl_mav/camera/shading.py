@@ -159,19 +159,8 @@ def paint(
 ) -> None:
     """Write the packed sRGB of left..end where `seen` is first..last; Lambert's and Beer's laws.
 
-    Args:
-        out: (n,) packed colours, written.
-        seen: (n,) what is seen.
-        lit: (n,) 1 in the sun, 0 in shadow.
-        clear: (n,) transmission of the fog.
-        left: Start of the part.
-        end: End of the part.
-        first: Lowest number of this surface in `seen`.
-        last: Highest.
-        points: The part's points.
-        surface: Its material.
-        light: The light.
-        atlas: `textures.atlas()`.
+    `lit` (n,) is 1 in the sun, 0 in shadow, `clear` (n,) the transmission of fog, `points` are
+    those of the part, and `atlas` is `textures.atlas()`.
     """
     place, facing, up, pattern, green_of, blue_of = points
     row, marks = out[left:end], seen[left:end]

@@ -64,18 +64,10 @@ def shade_by_walls(
     extinction: float,
     through: np.float32,
 ) -> None:
-    """Write the sunlight that passes the walls, and the transmission of fog.
+    """Write the sunlight `lit` (n,) that passes the walls, and the fog's transmission `clear`.
 
-    Args:
-        lit: (n,) written: share of the sun that arrives.
-        clear: (n,) written: transmission of the fog to the camera.
-        far: (n,) depth [m]; 0: no surface.
-        rays: Of the pixels.
-        camera: (3,) NED [m].
-        bounds: (6,) of the arena.
-        to_sun: (3,) unit vector NED.
-        extinction: Of fog [1/m].
-        through: Transmission of the walls; 0 but for glass.
+    `far` (n,) is depth [m], 0: no surface; `extinction` is that of fog [1/m], `through` the
+    transmission of the walls, 0 but for glass.
     """
     north, east, up = sized(to_sun[0]), sized(to_sun[1]), F32(-to_sun[2])
     # From the camera to the walls that the sunlight comes over.
@@ -145,25 +137,12 @@ def shade_by_obstacle(
     to_sun: Vec,
     through: np.float32,
 ) -> None:
-    """Put the points that an obstacle hides from the sun into shadow.
+    """Put the points that an obstacle hides from the sun into shadow: `lit` (n, m) times `through`.
 
-    Args:
-        lit: (n, m) changed: times `through` in shadow.
-        far: (n, m) depth [m].
-        ids: (n, m) what is seen.
-        corners: (CORNERS, 3) buffer.
-        number: Of the obstacle.
-        lines: Of the image, as are `xs` and `bent`.
-        xs: Rays of a line.
-        bent: A fisheye's rays instead of both; None: another projection.
-        view: The projection.
-        world: The camera's axes, and the obstacle's centre from the camera.
-        camera: (3,) NED [m].
-        shape: Of the obstacle, with the next two.
-        half: Half extents [m].
-        yaw: Heading of a box's first axis [rad].
-        to_sun: (3,) unit vector NED.
-        through: Transmission; 0 but for glass.
+    `far` (n, m) is depth [m], `ids` what is seen, `corners` (CORNERS, 3) a buffer, `number`,
+    `shape`, `half` [m] and `yaw` [rad] are the obstacle's, `world` holds the camera's axes and its
+    centre from the camera, `to_sun` (3,) is a unit vector NED; the rest as of
+    `raycast.draw_bodies`.
     """
     level = math.sqrt(to_sun[0] * to_sun[0] + to_sun[1] * to_sun[1])
     cos, sin = 1.0, 0.0
@@ -245,15 +224,9 @@ def shadow_rectangle(
 ) -> Rectangle:
     """Return the pixels of a pinhole that an obstacle's shadow volume projects to.
 
-    Args:
-        corners: (CORNERS, 3) buffer.
-        n_lines: Lines of the image.
-        n_pixels: Pixels of a line.
-        view: The projection.
-        pose: The camera's axes along the body's, and the body's centre from the camera.
-        half: Half extents of the box around the body [m].
-        sun: Unit vector towards the sun, along the body's axes.
-        floor: Depth of the floor below the body's centre [m].
+    `pose` has the camera's axes along the body's and the body's centre from the camera, `half` the
+    half extents of the box around it [m], `sun` the unit vector along the body's axes, `floor` the
+    depth of the floor below its centre [m]; `corners` (CORNERS, 3) is a buffer.
     """
     c = pose.center
     nearest, farthest = math.inf, -math.inf

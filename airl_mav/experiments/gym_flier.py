@@ -107,16 +107,9 @@ def navigation_of(
     trace: Trace | None = None,
     compensator: Compensator | None = None,
 ) -> Navigation:
-    """Return the vectorized simulator of a scenario, `slots` flights at a time.
+    """Return the vectorized simulator of a scenario, `slots` flights at a time, or UsageError.
 
-    Args:
-        scenario: The scenario.
-        slots: Flights at a time.
-        trace: Recorder.
-        compensator: Compensator of `slots` companions; None = the vehicle's.
-
-    Raises:
-        UsageError: The simulator does not support the scenario.
+    `trace` records; `compensator` is one of `slots` companions; None = the vehicle's.
     """
     asked = scenario.scenario
     return Navigation(

@@ -77,18 +77,8 @@ def refly_parts(
 ) -> tuple[Reflight, tuple[PartFlown, ...]]:
     """Rehearse a recorded flight with a whole refit, each part of it, and none, on equal seeds.
 
-    The change made by one part alone is what it explains; the parts need not add up.
-
-    Args:
-        path: The black box.
-        out: New folder: as of `refly`, and `parts` with the rest.
-        folder: Folder of the refit.
-        arena: See `refly`.
-        arena_seed: See `refly`.
-        episodes: Rehearsals of each.
-        policy: See `refly`.
-        trust: See `refly`.
-        progress: Draw a progress bar on standard error.
+    The change made by one part alone is what it explains; the parts need not add up. `folder` holds
+    the refit, `out` gets `parts` beside the folders of `refly`, which has the other arguments.
 
     Returns:
         The rehearsals with the whole refit, and the figures of each part.

@@ -197,17 +197,8 @@ class DoubleDQN(DQN):
     """DQN with double Q-learning, n-step returns and Dict observations of n vehicles.
 
     Intervals count steps of single vehicles. Vehicles explore independently. One generator draws
-    exploration and samples, so that a run can be resumed exactly.
-
-    Args:
-        policy: "MultiInputPolicy".
-        env: The vectorised environment.
-        n_step: Rewards summed before the bootstrap.
-        double: Choose the next action with the online network, not with the target network.
-        env_steps_per_update: Steps for each update.
-        target_update_interval: Steps between two updates of the target network.
-        precision: Number format of the networks' passes; weights and updates stay float32.
-        arguments: Further arguments of stable-baselines3's DQN.
+    exploration and samples, so that a run can be resumed exactly. Arguments are those of
+    `config.AlgorithmSpec` and of stable-baselines3's DQN.
     """
 
     def __init__(

@@ -32,14 +32,7 @@ from airl_mav.policy.observation_spec import Encoded
 
 
 class Demonstrations:
-    """Observations and the expert's actions.
-
-    Args:
-        steps: Decisions to remember, of all vehicles together.
-        vehicles: Vehicles a row.
-        shapes: Shape and type of each array of an observation, without the leading axis.
-        actions: The action space.
-    """
+    """Observations and the expert's actions; arguments as of `dqn.NStepReplay`."""
 
     def __init__(
         self,
@@ -100,23 +93,10 @@ class Demonstrations:
 class Imitation(BaseAlgorithm):
     """Learns what an expert does, on the networks of PPO; their value is not learned.
 
-    All intervals count steps of single vehicles. One generator draws who flies and what is learned
-    from, so that a run can be continued exactly.
-
-    Args:
-        policy: "MultiInputPolicy".
-        env: A `NavigationVecEnv`: the expert looks into it.
-        expert: Who is imitated.
-        learning_rate: Step of the optimiser.
-        batch_size: Samples an update.
-        buffer_size: Steps that are remembered.
-        learning_starts: Steps before the first update.
-        env_steps_per_update: Steps for each update.
-        expert_share_initial: Share of the decisions that the expert flies at first.
-        expert_share_final: The same in the end.
-        expert_share_fraction: Share of the training in which it falls, in a straight line.
-        max_grad_norm: Greatest norm of a gradient.
-        arguments: Further arguments of stable-baselines3's base class.
+    Intervals count steps of single vehicles. One generator draws who flies and what is learned
+    from, so that a run can be resumed exactly. `env` is a `NavigationVecEnv`, which the expert
+    looks into; the other arguments are those of `config.AlgorithmSpec`, its options and
+    stable-baselines3's base class.
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {

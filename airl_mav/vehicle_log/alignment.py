@@ -234,11 +234,8 @@ def _bounds(
 ) -> list[tuple[float, float]]:
     """Return the interval after the expected time [µs] in which each setpoint appears in the log.
 
-    Args:
-        expected_us: (k,) times without any delay.
-        sent: (k, m) setpoints.
-        seen: Tracked values (n, m).
-        near: (m,) tolerances of equality.
+    `expected_us` (k,) are the times without any delay, `sent` (k, m) the setpoints, `near` (m,) the
+    tolerances of equality.
     """
     bounds = []
     for k in range(1, len(sent)):

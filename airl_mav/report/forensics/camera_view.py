@@ -123,14 +123,8 @@ def view_obstacle(
 ) -> ObstacleView:
     """Return the direction and visibility of obstacle i on the frame exposed at `frame_us`.
 
-    Args:
-        path: The flight.
-        frame_us: Exposure of the frame [µs].
-        hit_us: Time of the collision [µs].
-        arena: The arena.
-        began_us: Start of the episode, and of the obstacles' motion [µs].
-        i: Index of the obstacle.
-        camera: The camera.
+    `hit_us` is the collision, `began_us` the start of the episode and of the obstacles' motion
+    [µs].
     """
     position, _, quaternion = pose_at(path, frame_us)
     centers, centers_then = (
