@@ -223,12 +223,8 @@ def open_recorder(
 ) -> BlackBoxRecorder:
     """Return the recorder of a mission into a new file of a folder, or raise FieldError.
 
-    Args:
-        folder: Output folder.
-        run: `setup` and `config` of `run.json`.
-        link: Connected.
-        clock: The companion's.
-        goal: North, east of the start [m], and down where it has a height.
+    `run` has `setup` and `config` of `run.json`; the goal is north, east and down from the start
+    [m].
     """
     now = utc_now()
     made = {

@@ -85,18 +85,10 @@ def _size(
     yaw: Floats,
     center_height: Floats,
 ) -> None:
-    """Write sizes, headings and heights of bodies of a shape (n,), as the fields of `Bodies`.
+    """Write `half_size` (n, 3), `yaw` (n,) and `center_height` (n,) of bodies of a shape (n,).
 
-    Args:
-        numbers: (5 n,) uniform in [0, 1): n pairs of half widths, n heights, n headings, n offsets
-            of spheres from the flight altitude, scaled as `Generator.uniform` does.
-        shape: (n,).
-        half_width_m: Range of half widths [m].
-        height_m: Range of heights [m].
-        altitude_m: Height above the floor that every sphere crosses [m].
-        half_size: (n, 3) [m], written.
-        yaw: (n,) [rad], written.
-        center_height: (n,) above the floor [m], written.
+    `numbers` (5 n,) in [0, 1) are n pairs of half widths, n heights, n headings and n offsets of
+    spheres from the flight altitude, scaled as `Generator.uniform` does.
     """
     n, (narrow, wide), (flat, tall) = len(shape), half_width_m, height_m
     for i in range(n):

@@ -48,16 +48,9 @@ def path_traced(
     samples: int,
     seed: int = 0,
 ) -> NDArray[np.uint8]:
-    """Return the sRGB image (height, width, 3) of an arena by Mitsuba's path tracer.
+    """Return the sRGB image of an arena by Mitsuba's path tracer; arguments as of `render.render`.
 
-    Args:
-        arena: The arena.
-        centers: (n, 3) present obstacle centres NED [m].
-        intrinsics: The camera.
-        position: (3,) camera NED [m].
-        quaternion: (4,) unit [w, x, y, z] camera -> NED.
-        samples: Paths per pixel; approximate off the middle of a cylinder or fisheye.
-        seed: Of the paths.
+    `samples` are paths per pixel, approximate off the middle of a cylinder or fisheye.
 
     Raises:
         UsageError: The arena has fog.

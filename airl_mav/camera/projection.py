@@ -121,12 +121,8 @@ def _reach(axis: Vec, half: Vec, sphere: bool) -> float:
 def pinhole_rectangle(out: Image, view: View, pose: Pose, half: Vec, sphere: bool) -> Rectangle:
     """Return the pixels of a pinhole that can see a body; empty when none can.
 
-    Args:
-        out: The image.
-        view: The camera.
-        pose: The camera's axes along the body's, and the body's centre.
-        half: Half extents of the body's bounding box along its own axes [m].
-        sphere: The body is a sphere of radius half[0].
+    `pose` has the camera's axes along the body's, and its centre, `half` the half extents of its
+    box [m]; a `sphere` has the radius half[0].
     """
     f, r, d, c = pose.forward, pose.along, pose.across, pose.center
     z, x, y = dot(f, c), dot(r, c), dot(d, c)

@@ -156,16 +156,10 @@ def run_cells(
     stop: Stop = never,
     ended: Callable[[CellRun], None] = lambda _: None,
 ) -> CampaignRun:
-    """Fly the rest of a campaign; see `run_cell`.
+    """Fly the rest of a campaign; arguments as of `run_cell`.
 
-    Args:
-        store: Its folder.
-        cells: Evaluations with different names, in order; those with the same flights share a run
-            folder.
-        executor: Executor of the flights.
-        progress: Progress display.
-        stop: Polled several times a second; True stops and keeps finished flights.
-        ended: Called for each complete cell, also if it was complete before.
+    `cells` have different names; those with the same flights share a run folder. `ended` is called
+    for each complete cell, also if it was complete before.
     """
     first_of = shared_flights(cells)
     unique = [cell for cell in cells if first_of[cell.name] is cell]

@@ -57,13 +57,8 @@ def overrides_of(
 ) -> tuple[Override, ...]:
     """Return the parameters in which a flight differs from its profile.
 
-    Args:
-        profile: The profile.
-        flying: The profile with the computer that flew along.
-        response: Fitted response.
-        thrust: Fitted thrust.
-        air: Fitted drag and wind.
-        logged: Parameters of the flight controller from its log.
+    `flying` is the profile with the computer that flew along, `logged` the parameters of the flight
+    controller from its log.
     """
     found: list[Override] = []
     carried_kg = flying.body.mass_kg - profile.body.mass_kg

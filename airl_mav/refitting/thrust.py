@@ -48,12 +48,7 @@ def fit_thrust(
 ) -> Thrust:
     """Fit maximum thrust per mass, and from it whichever of mass and thrust is unknown.
 
-    Args:
-        flown: The flight; without the vehicle's log the motor commands are unknown.
-        vehicle: The profile with its payload.
-        air: Fitted drag and wind.
-        known: Quantity to take from the profile.
-        rng: Generator of the interval's resamples.
+    Without the vehicle's log the motor commands are unknown; `vehicle` has its payload.
     """
     ratio = vehicle.thrust_n / vehicle.body.mass_kg
     blank = unobserved("thrust_per_mass_m_s2", "thrust per mass", "m/s²", "", ratio)

@@ -85,17 +85,10 @@ def still(
     rays: int,
     range_m: float,
 ) -> Pixels:
-    """Return a ray-cast picture from a camera position NED [m] and attitude [w, x, y, z].
+    """Return a ray-cast picture; arguments as of `render.render`, `range_m` is drawn darkest.
 
-    Args:
-        arena: The arena.
-        centers: (n, 3) present obstacle centres NED [m].
-        camera: Its intrinsics.
-        position: (3,) camera NED [m].
-        quaternion: (4,) unit [w, x, y, z] camera -> NED.
-        show: Content, except flow (see `report.ground_truth`).
-        rays: Rays per pixel and axis, for rgb and grey.
-        range_m: Depth drawn darkest [m].
+    `show` is its content, except flow (see `report.ground_truth`), `rays` the number per pixel and
+    axis for rgb and grey.
     """
     if show in ("rgb", "grey"):
         rgb = antialiased(arena, centers, camera, position, quaternion, rays)
