@@ -11,24 +11,27 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.quality import Quality
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.statistics import (
-    BOOTSTRAP_SEED,
-    CONFIDENCE,
     MEANS,
     NO_ESTIMATE,
-    RESAMPLES,
+    QUANTILE,
     Estimate,
+    bootstrap_interval,
     median_of,
 )
 
+Floats = NDArray[np.float64]
+
 Pair = tuple[EpisodeRecord, EpisodeRecord]
 """One seed: the flight of the reference, then the other one."""
+
+TANGO_PRECISION = 1e-12
+"""Accuracy to which the ends of Tango's interval are found, by bisection."""
 
 SAME_RATIO = 1e-12
 """Pairs whose ratios differ by no more than this differ by rounding alone."""
@@ -150,20 +153,19 @@ def tango(gained: int, lost: int, n: int) -> Estimate:
     if n == 0:
         return NO_ESTIMATE
     value = (gained - lost) / n
-    z = float(scipy.stats.norm.ppf(0.5 + 0.5 * CONFIDENCE))
 
     def end(limit: float) -> float:
         # The score falls from +inf at -1 through 0 at the estimate to -inf at +1.
         if value == limit:
             return limit
-        low, high = sorted((value, limit))
-        found = scipy.optimize.brentq(
-            lambda difference: _score(difference, gained, lost, n) + limit * z,
-            low,
-            high,
-            xtol=1e-12,
-        )
-        return float(found)
+        inside, outside = value, limit
+        while abs(outside - inside) > TANGO_PRECISION:
+            middle = 0.5 * (inside + outside)
+            if abs(_score(middle, gained, lost, n)) < QUANTILE:
+                inside = middle
+            else:
+                outside = middle
+        return 0.5 * (inside + outside)
 
     return Estimate(value, end(-1.0), end(1.0), n)
 
@@ -204,29 +206,16 @@ def relative_difference(reference: ArrayLike, other: ArrayLike) -> Estimate:
     n = first.size
     if n == 0:
         return NO_ESTIMATE
-    value = float(_percent(first, second))
+    value = percent_change(float(first.mean()), float(second.mean()))
     if n == 1:
         return Estimate(value, None, None, 1)
     if np.ptp(second / first) <= SAME_RATIO:
         return Estimate(value, value, value, n)
-    interval = scipy.stats.bootstrap(
-        (first, second),
-        _percent,
-        paired=True,
-        confidence_level=CONFIDENCE,
-        n_resamples=RESAMPLES,
-        rng=np.random.default_rng(BOOTSTRAP_SEED),
-        method="BCa",
-    ).confidence_interval
-    return Estimate(value, float(interval.low), float(interval.high), n)
+    return Estimate(value, *bootstrap_interval((first, second), _percent), n)
 
 
-def _percent(
-    first: NDArray[np.float64], second: NDArray[np.float64], axis: int = -1
-) -> NDArray[np.float64]:
-    mean = first.mean(axis=axis)
-    difference: NDArray[np.float64] = 100.0 * (second.mean(axis=axis) - mean) / mean
-    return difference
+def _percent(reference: Floats, other: Floats) -> Floats:
+    return 100.0 * (other - reference) / reference
 
 
 def compare_pairs(

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from statistics import NormalDist
 
 import numpy as np
-import scipy
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.quality import Quality
@@ -17,6 +17,7 @@ from airl_mav.flight.record import EpisodeRecord
 CONFIDENCE = 0.95
 QUANTILE = 1.959963984540054
 """Of the normal distribution, for a two-sided 95 % interval: `scipy.special.ndtri(0.975)`."""
+NORMAL = NormalDist()
 RESAMPLES = 2000
 BOOTSTRAP_SEED = 20_210_409
 """The same episodes always get the same interval."""
@@ -114,15 +115,39 @@ def bootstrap_mean(values: ArrayLike) -> Estimate:
         return Estimate(mean, None, None, 1)
     if np.ptp(data) == 0.0:
         return Estimate(mean, mean, mean, data.size)
-    interval = scipy.stats.bootstrap(
-        (data,),
-        np.mean,
-        confidence_level=CONFIDENCE,
-        n_resamples=RESAMPLES,
-        rng=np.random.default_rng(BOOTSTRAP_SEED),
-        method="BCa",
-    ).confidence_interval
-    return Estimate(mean, float(interval.low), float(interval.high), data.size)
+    return Estimate(mean, *bootstrap_interval((data,), lambda means: means), data.size)
+
+
+def bootstrap_interval(
+    samples: Sequence[NDArray[np.float64]], statistic: Callable[..., NDArray[np.float64]]
+) -> tuple[float, float]:
+    """Return the seeded 95 % bootstrap interval of a function of means.
+
+    Bias-corrected and accelerated: Efron & Tibshirani, An Introduction to the Bootstrap, 1993,
+    section 14.3. The same figures as `scipy.stats.bootstrap`, whose import takes two seconds of
+    processor time, and in memory proportional to n instead of its square.
+
+    Args:
+        samples: Paired samples, each (n,), n >= 2, not all equal.
+        statistic: Takes the means (k,) of each sample and returns values (k,).
+    """
+    n = samples[0].size
+    draws = np.random.default_rng(BOOTSTRAP_SEED).integers(0, n, (RESAMPLES, n))
+    resampled = statistic(*(sample[draws].mean(axis=-1) for sample in samples))
+    observed = statistic(*(sample.mean(keepdims=True) for sample in samples))
+    without_one = statistic(*((sample.sum() - sample) / (n - 1) for sample in samples))
+    below = 0.5 * (np.mean(resampled < observed) + np.mean(resampled <= observed))
+    bias = NORMAL.inv_cdf(min(max(float(below), 0.5 / RESAMPLES), 1.0 - 0.5 / RESAMPLES))
+    influence = without_one.mean() - without_one
+    spread = float((influence**2).sum()) ** 1.5
+    acceleration = float((influence**3).sum()) / (6.0 * spread) if spread else 0.0
+
+    def end(quantile: float) -> float:
+        shifted = bias + quantile
+        share = NORMAL.cdf(bias + shifted / (1.0 - acceleration * shifted))
+        return float(np.quantile(resampled, share))
+
+    return end(-QUANTILE), end(QUANTILE)
 
 
 def median_of(values: ArrayLike) -> Estimate:
@@ -137,11 +162,19 @@ def median_of(values: ArrayLike) -> Estimate:
     if not n:
         return NO_ESTIMATE
     # The greatest number of values that may be left out on either side.
-    out = int(scipy.stats.binom.ppf(0.5 * (1.0 - CONFIDENCE), n, 0.5)) - 1
+    out = _binomial_quantile(0.5 * (1.0 - CONFIDENCE), n) - 1
     middle = float(np.median(data))
     if out < 0:
         return Estimate(middle, None, None, n)
     return Estimate(middle, float(data[out]), float(data[n - 1 - out]), n)
+
+
+def _binomial_quantile(probability: float, n: int) -> int:
+    """Return the least number of heads in n tosses of a coin whose cumulated share reaches it."""
+    heads = np.arange(n)
+    steps = np.log(n - heads) - np.log1p(heads)
+    logarithms = np.concatenate([[0.0], np.cumsum(steps)]) - n * math.log(2.0)
+    return int(np.searchsorted(np.cumsum(np.exp(logarithms)), probability))
 
 
 def reached_goals(episodes: Sequence[EpisodeRecord]) -> list[bool]:

@@ -9,7 +9,13 @@ import scipy
 
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
-from airl_mav.flight.statistics import aggregate, bootstrap_mean, wilson
+from airl_mav.flight.statistics import (
+    BOOTSTRAP_SEED,
+    RESAMPLES,
+    aggregate,
+    bootstrap_mean,
+    wilson,
+)
 from tests.support.run_demo import demo_arena, demo_episode
 
 
@@ -35,6 +41,24 @@ def test_the_bootstrap_of_many_values_is_the_normal_interval() -> None:
     assert estimate.low == pytest.approx(values.mean() - half, abs=0.1 * half)
     assert estimate.high == pytest.approx(values.mean() + half, abs=0.1 * half)
     assert bootstrap_mean(values) == estimate
+
+
+@pytest.mark.parametrize("n", [2, 3, 10, 200])
+def test_the_bootstrap_interval_is_scipys(n: int) -> None:
+    for values in (
+        np.random.default_rng(n).gamma(0.5, 3.0, n),
+        np.where(np.arange(n) == 0, 70.0, 8.0),
+    ):
+        mine = bootstrap_mean(values)
+        theirs = scipy.stats.bootstrap(
+            (values,),
+            np.mean,
+            n_resamples=RESAMPLES,
+            rng=np.random.default_rng(BOOTSTRAP_SEED),
+            method="BCa",
+        ).confidence_interval
+        assert mine.low == pytest.approx(theirs.low, rel=1e-9)
+        assert mine.high == pytest.approx(theirs.high, rel=1e-9)
 
 
 def test_too_few_values_to_resample() -> None:
