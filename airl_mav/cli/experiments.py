@@ -13,12 +13,19 @@ from airl_mav.cli.telling import Telling, Voice
 from airl_mav.core.fields import quantity
 from airl_mav.core.progress import DRAWING
 from airl_mav.experiments.experiment import Experiment, ExperimentRun, run_experiment
-from airl_mav.experiments.gap import DEFAULT_COMPUTER, DEFAULT_REFERENCE
 from airl_mav.experiments.live import EXIT_CODES
 from airl_mav.report.comparison.show import print_comparison
 from airl_mav.report.verdict import load_verdict
 from airl_mav.scenario.aircraft import Aircraft
-from airl_mav.scenario.model import GREATEST_EPISODES, Decisions, Flights, Lateness, LevelName
+from airl_mav.scenario.model import (
+    GREATEST_EPISODES,
+    ONBOARD_COMPUTER,
+    REFERENCE_COMPUTER,
+    Decisions,
+    Flights,
+    Lateness,
+    LevelName,
+)
 
 NOTHING_REQUIRED = Gate()
 FOR_PEOPLE = Telling()
@@ -42,11 +49,11 @@ class OnboardOptions(Gate, ExperimentOptions):
     """A policy on an onboard computer, compared with a reference."""
 
     computer: str = Field(
-        default=DEFAULT_COMPUTER,
+        default=ONBOARD_COMPUTER,
         description="onboard computer: a shipped profile, or a path to a .toml",
     )
     reference: str = Field(
-        default=DEFAULT_REFERENCE,
+        default=REFERENCE_COMPUTER,
         description="computer that the onboard computer is compared with: a shipped profile, or a"
         " path",
     )

@@ -15,13 +15,11 @@ from airl_mav.policy.card import PolicyCard
 from airl_mav.policy.registry import PolicyInfo, find_policy
 from airl_mav.profiles.computer import load_computer
 from airl_mav.profiles.vehicle import load_vehicle
-from airl_mav.scenario.model import Scenario
+from airl_mav.scenario.model import REFERENCE_COMPUTER, Scenario
 
 DEFAULT_UNMITIGATED, DEFAULT_MITIGATED = "static-obstacles", "static-obstacles-ras-pi-4"
 """Shipped policies of one kind of training: as fast as a workstation decides, and as late as the
 paper's Raspberry Pi."""
-
-DEFAULT_COMPUTER, DEFAULT_REFERENCE = "ras-pi-4", "workstation"
 
 DEFAULT_WORKLOAD = "template-5x32"
 """The paper's network for No Obstacles, and that of its mitigation: 396 ms on the Raspberry Pi."""
@@ -75,7 +73,7 @@ def gap(
     scenario: Scenario,
     *,
     mitigated: str = DEFAULT_MITIGATED,
-    reference: str = DEFAULT_REFERENCE,
+    reference: str = REFERENCE_COMPUTER,
     reference_workload: str | None = None,
     arenas: Sequence[str] = (),
     out: Path | str | None = None,
@@ -112,7 +110,7 @@ def declare_gap(
     scenario: Scenario,
     *,
     mitigated: str = DEFAULT_MITIGATED,
-    reference: str = DEFAULT_REFERENCE,
+    reference: str = REFERENCE_COMPUTER,
     reference_workload: str | None = None,
     arenas: Sequence[str] = (),
 ) -> Experiment:

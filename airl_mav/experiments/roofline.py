@@ -19,7 +19,7 @@ from airl_mav.core.provenance import provenance
 from airl_mav.envs.noticing import noticed_m
 from airl_mav.envs.roofline import LeftOut, Roofline, RooflinePoint, roofline_point
 from airl_mav.envs.stopping import DecisionLoop, StoppingTask
-from airl_mav.experiments.gap import DEFAULT_COMPUTER, DEFAULT_REFERENCE, DEFAULT_WORKLOAD
+from airl_mav.experiments.gap import DEFAULT_WORKLOAD
 from airl_mav.latency.injection import ESTIMATE, Injection, choose_injection
 from airl_mav.policy.card import vehicle_mismatch
 from airl_mav.policy.learned import load_learned
@@ -31,7 +31,12 @@ from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from airl_mav.report.document import Document, write_document
 from airl_mav.report.roofline import roofline_document
 from airl_mav.scenario.aircraft import DEFAULT_VEHICLE, VehicleName
-from airl_mav.scenario.model import DEFAULT_POLICY, PilotSettings
+from airl_mav.scenario.model import (
+    DEFAULT_POLICY,
+    ONBOARD_COMPUTER,
+    REFERENCE_COMPUTER,
+    PilotSettings,
+)
 
 SCHEMA = 1
 
@@ -45,7 +50,7 @@ class RooflineRequest(ProfileModel):
     """A vehicle, what it sees and who decides, and the computers that it might carry."""
 
     computers: tuple[str, ...] = Field(
-        default=(DEFAULT_COMPUTER, DEFAULT_REFERENCE),
+        default=(ONBOARD_COMPUTER, REFERENCE_COMPUTER),
         description="computer profiles: shipped names, or paths to .toml",
     )
     workload: str = Field(

@@ -34,6 +34,8 @@ PolicyName = Annotated[
 ]
 
 DEFAULT_POLICY, DEFAULT_ARENA = "static-obstacles-fast", "static-obstacles"
+ONBOARD_COMPUTER, REFERENCE_COMPUTER = "ras-pi-4", "workstation"
+"""Default computers of experiments that compare an onboard computer with a reference."""
 """What is shipped and decides, and is flown in, by default."""
 
 GREATEST_SEED = 2**31

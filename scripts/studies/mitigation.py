@@ -20,15 +20,15 @@ from airl_mav.cli.options import run_command, scenario_of
 from airl_mav.core.console import new_console
 from airl_mav.core.fields import quantity
 from airl_mav.experiments.experiment import Experiment
-from airl_mav.experiments.gap import DEFAULT_MITIGATED, DEFAULT_REFERENCE, declare_gap
-from airl_mav.scenario.model import Scenario
+from airl_mav.experiments.gap import DEFAULT_MITIGATED, declare_gap
+from airl_mav.scenario.model import REFERENCE_COMPUTER, Scenario
 
 OPTIONS = create_model("Options", __base__=StudyOptions, __doc__=__doc__)
 
 
 class MitigationConfig(StudyConfig):
     mitigated: str = Field(default=DEFAULT_MITIGATED, description="a name, or a path to a folder")
-    reference: str = Field(default=DEFAULT_REFERENCE, description="computer of the reference")
+    reference: str = Field(default=REFERENCE_COMPUTER, description="computer of the reference")
     training: dict[str, str] = Field(
         default={}, description="training configuration by policy, where it is not of its name"
     )

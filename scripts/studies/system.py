@@ -22,8 +22,8 @@ from airl_mav.core.console import new_console
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel
 from airl_mav.experiments.experiment import Experiment
-from airl_mav.experiments.gap import DEFAULT_REFERENCE, NOT_MITIGATED, declare_gap
-from airl_mav.scenario.model import Scenario
+from airl_mav.experiments.gap import NOT_MITIGATED, declare_gap
+from airl_mav.scenario.model import REFERENCE_COMPUTER, Scenario
 
 OPTIONS = create_model("Options", __base__=StudyOptions, __doc__=__doc__)
 
@@ -36,7 +36,7 @@ class ArenaConfig(ProfileModel):
 
 class SystemConfig(StudyConfig):
     arenas: tuple[ArenaConfig, ...] = Field(min_length=1, description="what flies where")
-    reference: str = Field(default=DEFAULT_REFERENCE, description="computer of the reference")
+    reference: str = Field(default=REFERENCE_COMPUTER, description="computer of the reference")
     one_goal: OneGoal | None = Field(default=None, description="flights to one goal")
 
 
