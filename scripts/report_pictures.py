@@ -2,6 +2,7 @@ r"""The pictures of the report in the documentation, as Chromium shows them.
 
     airl evaluate static-obstacles --level lockstep --computer ras-pi-4 --workload template-5x32 \
         --episodes 20 --out RUN
+    airl report RUN
     python scripts/report_pictures.py RUN    # writes docs/images/rehearsal.png and report.png
 
 The first is the first screen, the second the worst flight and how it followed its commands.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from pydantic import Field
 from rich.console import Console
@@ -15,21 +15,18 @@ from airl_mav.cli.options import POSITIONAL, scenario_of
 from airl_mav.cli.telling import Voice
 from airl_mav.cli.viewing import Viewing, view_of
 from airl_mav.core.errors import FieldError
-from airl_mav.experiments.evaluate import check_plain, evaluation_cells, matrix, write_on_card
-from airl_mav.experiments.experiment import known_seeds
-from airl_mav.experiments.fly import fly_scenario, run_name
-from airl_mav.experiments.live import EXIT_CODES, FlownRun, fly_live
-from airl_mav.flight.record import run_sha256
-from airl_mav.flight.requirements import Requirement
-from airl_mav.rehearsal.run_folder import load
-from airl_mav.report.run_report import show_report, verdict_of
+
+if TYPE_CHECKING:
+    from airl_mav.experiments.live import FlownRun
+    from airl_mav.flight.requirements import Requirement
 
 
 class EvaluateOptions(Gate, Viewing, ExperimentOptions):
     """Fly policies through seeded episodes: success, time, distance and energy with intervals.
 
     Several policies or arenas give a table of policies x arenas. The same --out goes on with what
-    was interrupted; a finished evaluation shows its tables again.
+    was interrupted; a finished evaluation shows its tables again. airl report RUN draws the page of
+    a run.
 
     Examples:
         airl evaluate static-obstacles --episodes 1000
@@ -70,6 +67,17 @@ OPTIONS = EvaluateOptions
 
 def run(options: EvaluateOptions, console: Console | None = None) -> int:
     """Evaluate; return 0, 1 (workers lost), 3 to 5 (verdict) or 130 (Ctrl-C)."""
+    # Imported here and below: options need no simulator.
+    from airl_mav.experiments.evaluate import (
+        check_plain,
+        evaluation_cells,
+        matrix,
+        write_on_card,
+    )
+    from airl_mav.experiments.experiment import known_seeds
+    from airl_mav.experiments.fly import fly_scenario, run_name
+    from airl_mav.experiments.live import fly_live
+
     voice = Voice(options, "airl evaluate", console)
     scenario = scenario_of(options, policy=options.policies[0] if options.policies else None)
     each_fault = options.each_fault
@@ -108,6 +116,12 @@ def run(options: EvaluateOptions, console: Console | None = None) -> int:
 
 
 def _show(flown: FlownRun, gate: Gate, requirements: Sequence[Requirement], voice: Voice) -> int:
+    from airl_mav.experiments.live import EXIT_CODES
+    from airl_mav.flight.record import run_sha256
+    from airl_mav.rehearsal.run_folder import load
+    from airl_mav.report.document import REPORT_FILE
+    from airl_mav.report.run_report import show_report, verdict_of
+
     code = EXIT_CODES[flown.ended]
     if not flown.episodes:
         voice.console.print(f"no episode was finished; {flown.path}", soft_wrap=True)
@@ -115,13 +129,15 @@ def _show(flown: FlownRun, gate: Gate, requirements: Sequence[Requirement], voic
         return code
     loaded = load(flown.path)
     verdict = verdict_of(loaded, requirements)
-    page = show_report(loaded, verdict, voice.console, voice.progress)
     more: list[str] = []
     if flown.ended == "complete":
         leave(gate, verdict, "airl evaluate")
         code = verdict.exit_code
         if (sha256 := run_sha256(flown.episodes)) is not None:
             more = [f"sha256 of the flights  {sha256}"]
+    # A page that was drawn of fewer flights, or under another verdict, would be wrong.
+    drawn = (flown.path / REPORT_FILE).exists()
+    page = show_report(loaded, verdict, voice.console, voice.progress, draw=drawn)
     for line in more:
         voice.console.print(line, soft_wrap=True, highlight=False)
     runs = {flown.path.name: loaded}

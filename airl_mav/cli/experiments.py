@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pydantic import Field
 from rich.console import Console
@@ -11,11 +11,6 @@ from rich.console import Console
 from airl_mav.cli.gate import Gate, leave, requirements_of
 from airl_mav.cli.telling import Telling, Voice
 from airl_mav.core.fields import quantity
-from airl_mav.core.progress import DRAWING
-from airl_mav.experiments.experiment import Experiment, ExperimentRun, run_experiment
-from airl_mav.experiments.live import EXIT_CODES
-from airl_mav.report.comparison.show import print_comparison
-from airl_mav.report.verdict import load_verdict
 from airl_mav.scenario.aircraft import Aircraft
 from airl_mav.scenario.model import (
     GREATEST_EPISODES,
@@ -26,6 +21,9 @@ from airl_mav.scenario.model import (
     Lateness,
     LevelName,
 )
+
+if TYPE_CHECKING:
+    from airl_mav.experiments.experiment import Experiment, ExperimentRun
 
 NOTHING_REQUIRED = Gate()
 FOR_PEOPLE = Telling()
@@ -76,6 +74,10 @@ def fly_and_show(
 
     The status is 0, 1 (workers lost), 3 to 5 (verdict) or 130 (Ctrl-C).
     """
+    # Imported here and below: options need no simulator, and no flight waits for figures.
+    from airl_mav.experiments.experiment import run_experiment
+    from airl_mav.experiments.live import EXIT_CODES
+
     voice = Voice(telling, COMMANDS.get(experiment.kind, f"airl {experiment.kind}"), console)
     requirements = requirements_of(gate)
     with voice:
@@ -84,13 +86,15 @@ def fly_and_show(
         if len(flown.cells) < 2 and flown.ended != "complete":
             voice.finish(code, flown.ended, flown.path)
             return code, flown
-        voice.progress.status(DRAWING)
-        comparison, loaded, page = flown.compare(requirements)
-        voice.progress.status(None)
-        print_comparison(comparison, loaded, voice.console, page)
-        verdict = load_verdict(flown.path)
+        from airl_mav.report.comparison.show import judge_comparison, show_comparison
+
+        comparison, loaded = flown.compare()
+        verdict = judge_comparison(comparison, loaded, requirements)
         if flown.ended == "complete":
             leave(gate, verdict, f"airl {experiment.kind}")
             code = verdict.exit_code
+        page = show_comparison(
+            comparison, loaded, flown.path, voice.console, verdict, voice.progress
+        )
         voice.finish(code, flown.ended, flown.path, verdict=verdict, page=page, runs=loaded)
     return code, flown

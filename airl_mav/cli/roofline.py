@@ -9,7 +9,7 @@ from rich.console import Console
 
 from airl_mav.core.console import new_console
 from airl_mav.experiments.roofline import RooflineRequest, roofline
-from airl_mav.report.document import print_document
+from airl_mav.report.document import print_document, print_place
 
 
 class RooflineOptions(RooflineRequest):
@@ -38,5 +38,7 @@ def run(options: RooflineOptions, console: Console | None = None) -> int:
     """Work out and fly the roofline, and show it; 0. Raises UsageError as `roofline`."""
     asked = {name: getattr(options, name) for name in RooflineRequest.model_fields}
     result = roofline(RooflineRequest(**asked), out=options.out)
-    print_document(result.document, console or new_console(), result.page)
+    console = console or new_console()
+    print_document(result.document, console)
+    print_place(result.document.name, result.page, console)
     return 0

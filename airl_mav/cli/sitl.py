@@ -17,7 +17,6 @@ from airl_mav.cli.telling import Telling, Voice
 from airl_mav.cli.video import watcher_of
 from airl_mav.cli.viewing import Viewing, view_of
 from airl_mav.core.ports import LOOPBACK
-from airl_mav.core.progress import DRAWING
 from airl_mav.experiments.live import EXIT_CODES, FlownRun, fly_live
 from airl_mav.profiles.camera_kind import SLOW
 from airl_mav.rehearsal.video import video_shown, video_words
@@ -99,16 +98,15 @@ def conclude(flown: FlownRun, gate: Gate, requirements: Sequence[Requirement], v
         _say(voice.console, f"no episode was finished; logs in {flown.path}")
         voice.finish(EXIT_CODES[flown.ended], flown.ended, flown.path)
         return 0
-    voice.progress.status(DRAWING)
     # Imported here: the figures take seconds to load, which no flight has to wait for.
     from airl_mav.rehearsal.run_folder import load
     from airl_mav.report.run_report import show_report, verdict_of
 
     run = load(flown.path)
     verdict = verdict_of(run, requirements)
-    page = show_report(run, verdict, voice.console, voice.progress)
     if flown.ended == "complete":
         leave(gate, verdict, "airl-sitl")
+    page = show_report(run, verdict, voice.console, voice.progress)
     voice.finish(
         EXIT_CODES[flown.ended] or verdict.exit_code,
         flown.ended,

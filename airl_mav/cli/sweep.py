@@ -15,7 +15,7 @@ from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED, FieldError
 from airl_mav.core.progress import RichProgress
 from airl_mav.experiments.process_executor import open_executor
 from airl_mav.rehearsal.signals import stop_on_signals
-from airl_mav.report.document import print_document, write_document
+from airl_mav.report.document import print_document, print_place, write_document
 from airl_mav.sweep.document import document_of
 from airl_mav.sweep.run import SweepRequest, run_sweep
 from airl_mav.sweep.tables import print_plan
@@ -68,7 +68,8 @@ def run(options: SweepOptions, console: Console | None = None) -> int:
             progress.note(error, "yellow")
     if sweep.ended:
         document = document_of(sweep)
-        print_document(document, console, write_document(document, path))
+        print_document(document, console)
+        print_place(document.name, write_document(document, path), console)
     if sweep.ended == sweep.planned:
         return 0
     told = "interrupted" if error is None else "not all trials have ended"

@@ -32,8 +32,8 @@ class Telling(ProfileModel):
 
     quiet: bool = Field(
         default=False,
-        description="print nothing but the result: the verdict and where the report lies; errors go"
-        " to standard error",
+        description="print nothing but the result: the verdict and the path of the report or run"
+        " folder; errors go to standard error",
     )
     json_lines: bool = Field(
         default=False,

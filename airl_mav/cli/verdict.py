@@ -15,7 +15,6 @@ from airl_mav.cli.telling import Voice
 from airl_mav.experiments.live import EXIT_CODES
 from airl_mav.experiments.verdict import seek_verdict
 from airl_mav.flight.sequential import LOOKS
-from airl_mav.report.comparison.show import print_comparison
 from airl_mav.scenario.model import (
     DEFAULT_ARENA,
     DEFAULT_POLICY,
@@ -83,13 +82,18 @@ def run(options: VerdictOptions, console: Console | None = None) -> int:
             out=options.out,
             progress=voice.progress,
         )
-        verdict, page, runs = sought.verdict, sought.page, sought.runs or {}
+        verdict, comparison, runs = sought.verdict, sought.comparison, sought.runs or {}
         code = EXIT_CODES[sought.ended]
-        if verdict is None or sought.comparison is None or page is None:
+        if verdict is None or comparison is None:
             voice.finish(code, sought.ended, sought.path)
             return code
-        print_comparison(sought.comparison, runs, voice.console, page)
+        # Imported here: no flight waits for figures to be loaded.
+        from airl_mav.report.comparison.show import show_comparison
+
         leave(options, verdict, "airl verdict")
+        page = show_comparison(
+            comparison, runs, sought.path, voice.console, verdict, voice.progress
+        )
         code = verdict.exit_code
         voice.finish(code, sought.ended, sought.path, verdict=verdict, page=page, runs=runs)
     return code

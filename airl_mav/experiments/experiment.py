@@ -17,11 +17,9 @@ from airl_mav.experiments.live import Ended, fly_live, tell_end
 from airl_mav.experiments.process_executor import open_executor
 from airl_mav.experiments.run import Run
 from airl_mav.experiments.store import CampaignStore, Declaration, DeclaredCell, open_campaign
-from airl_mav.flight.requirements import Requirement
 from airl_mav.rehearsal.run_folder import LoadedRun, load
 from airl_mav.rehearsal.signals import stop_on_signals
 from airl_mav.report.comparison.model import Comparison, Kind, RunEntry
-from airl_mav.report.comparison.show import build_comparison, judge_comparison, write_comparison
 from airl_mav.report.table import count_outcomes
 from airl_mav.scenario.model import Scenario, free_fields
 from airl_mav.scenario.resolve import resolve
@@ -80,28 +78,17 @@ class ExperimentRun:
         """The run of each cell, by its name."""
         return {flown.cell.name: Run(flown.path) for flown in self.cells}
 
-    def compare(
-        self, requirements: Sequence[Requirement] | None = None
-    ) -> tuple[Comparison, dict[str, LoadedRun], Path]:
-        """Write the comparison; return it with its runs by name and the path of its page.
+    def compare(self) -> tuple[Comparison, dict[str, LoadedRun]]:
+        """Return the comparison and its runs by name. Raises UsageError: no cell has flights."""
+        # Imported here: the figures, which a single evaluation does without, are part of it.
+        from airl_mav.report.comparison.show import build_comparison
 
-        Args:
-            requirements: Requirements of the runs; None = the folder's last ones.
-
-        Raises:
-            UsageError: No cell has flights, or the folder cannot be written.
-        """
         here, experiment = self.path.absolute(), self.experiment
         entries = [
             entry_of(flown.cell, flown.path.absolute().relative_to(here).as_posix())
             for flown in self.cells
         ]
-        comparison, loaded = build_comparison(self.path, experiment.kind, experiment.facts, entries)
-        verdict = (
-            None if requirements is None else judge_comparison(comparison, loaded, requirements)
-        )
-        page = write_comparison(comparison, loaded, self.path, verdict)
-        return comparison, loaded, page
+        return build_comparison(self.path, experiment.kind, experiment.facts, entries)
 
 
 @dataclass(frozen=True)
@@ -156,10 +143,13 @@ def run_and_compare(
     experiment: Experiment, out: Path | str | None, *, progress: bool
 ) -> ExperimentResult:
     """Fly an experiment and compare its runs, for the API's functions; raises as `evaluate`."""
+    from airl_mav.report.comparison.show import write_comparison
+
     with shown(progress) as shows:
         flown = run_experiment(experiment, None if out is None else Path(out), shows)
     raise_unless_complete(flown.ended, flown.problem)
-    comparison, _, page = flown.compare()
+    comparison, loaded = flown.compare()
+    page = write_comparison(comparison, loaded, flown.path)
     return ExperimentResult(flown.path, flown.runs, comparison, page)
 
 

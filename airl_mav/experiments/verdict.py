@@ -10,10 +10,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import FieldError
-from airl_mav.core.progress import DRAWING, Progress
+from airl_mav.core.progress import Progress
 from airl_mav.experiments.campaign import Cell
 from airl_mav.experiments.executors import Executor
 from airl_mav.experiments.experiment import entry_of, file_name, known_seeds
@@ -24,11 +25,13 @@ from airl_mav.flight.requirements import Requirement
 from airl_mav.flight.sequential import LOOKS, Decision
 from airl_mav.flight.statistics import reached_goals
 from airl_mav.rehearsal.run_folder import RUN_FILE, check_folder, load_info
-from airl_mav.report.comparison import show
 from airl_mav.report.comparison.model import Comparison, comparison_file
 from airl_mav.report.verdict import OverallVerdict
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
+
+if TYPE_CHECKING:
+    from airl_mav.report.comparison import show
 
 
 @dataclass(frozen=True)
@@ -42,7 +45,6 @@ class SoughtVerdict:
     """None: it was interrupted or broken off."""
     comparison: Comparison | None = None
     runs: show.Runs | None = None
-    page: Path | None = None
 
 
 def seek_verdict(
@@ -96,15 +98,15 @@ def seek_verdict(
         flown = fly(undelayed, max(n, _planned(out / undelayed.name)))
     if flown.ended != "complete":
         return SoughtVerdict(out, flown.ended)
-    progress.status(DRAWING)
+    # Imported here: no flight waits for figures to be loaded.
+    from airl_mav.report.comparison import show
+
     facts = {**declared.facts, "episodes": n, show.FLOWN_UNTIL: "the success rate was decided"}
     # The number planned is that of the last look, as the run says itself.
     entries = [replace(entry_of(cell, cell.name), planned=None) for cell in (undelayed, target)]
     comparison, runs = show.build_comparison(out, declared.kind, facts, entries)
     verdict = show.judge_comparison(comparison, runs, requirements)
-    page = show.write_comparison(comparison, runs, out, verdict)
-    progress.status(None)
-    return SoughtVerdict(out, "complete", verdict, comparison, runs, page)
+    return SoughtVerdict(out, "complete", verdict, comparison, runs)
 
 
 def _fly(

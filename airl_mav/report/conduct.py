@@ -8,7 +8,6 @@ import numpy as np
 
 from airl_mav.core.constants import MS_PER_S, US_PER_S
 from airl_mav.core.errors import UsageError
-from airl_mav.envs.stopping import DecisionLoop, StoppingTask
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.smoothness import BANDWIDTH_HZ, command_steps
 from airl_mav.flight.statistics import known, successful
@@ -47,6 +46,9 @@ class Budget:
 
 def _budget(run: LoadedRun) -> Budget | None:
     """Return the budget of a run's policy; None: nothing tells how far off it takes notice."""
+    # Imported here: with scipy's solvers, which few policies need.
+    from airl_mav.envs.stopping import DecisionLoop, StoppingTask
+
     try:
         card = find_policy(run.info.config["policy"]).card
         vehicle = vehicle_of(run.info)

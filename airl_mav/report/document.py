@@ -7,9 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from rich.console import Console
 from rich.text import Text
 
@@ -18,7 +17,11 @@ from airl_mav.core.files import replace_file
 from airl_mav.flight.statistics import Estimate
 from airl_mav.report import table
 from airl_mav.report.measures import interval_of
-from airl_mav.report.theme import Picture, montage
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+
+    from airl_mav.report.theme import Picture
 
 REPORT_FILE = "report.html"
 """The page of a single run, in its folder."""
@@ -122,6 +125,9 @@ def run_link(name: str, run: Path, folder: Path) -> RunLink:
 @cache
 def environment() -> Environment:
     """Return the template engine: everything escaped, nothing undefined passed over."""
+    # Imported here and below: tables and verdicts are printed before anything is drawn.
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
     made = Environment(
         loader=PackageLoader("airl_mav.report"),
         autoescape=True,
@@ -153,6 +159,8 @@ def provenance_facts(
 
 def write_document(document: Document, folder: Path) -> Path:
     """Write page, Markdown and PNG files, each atomically; return the page's path."""
+    from airl_mav.report.theme import montage
+
     try:
         folder.mkdir(parents=True, exist_ok=True)
         drawn = []
@@ -205,8 +213,8 @@ def print_verdict(lines: Sequence[str], console: Console) -> None:
         console.print(Text(line, style="bold"))
 
 
-def print_document(document: Document, console: Console, page: Path) -> None:
-    """Print answers, facts and tables, and where the page lies."""
+def print_document(document: Document, console: Console) -> None:
+    """Print answers, facts and tables."""
     if document.answers:
         print_verdict(((document.lead,) if document.lead else ()) + document.answers, console)
         console.print()
@@ -229,5 +237,9 @@ def print_document(document: Document, console: Console, page: Path) -> None:
             console.print()
             for sentence in section.sentences:
                 console.print(Text(sentence))
+
+
+def print_place(name: str, place: Path | str, console: Console) -> None:
+    """Print, as the last line, the path of a page or the command that draws it."""
     console.print()
-    console.print(Text.assemble((f"{document.name}  ", "dim"), str(page)), soft_wrap=True)
+    console.print(Text.assemble((f"{name}  ", "dim"), str(place)), soft_wrap=True)

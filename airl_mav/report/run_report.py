@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
-from rich.text import Text
 
 from airl_mav.core.collecting import seldom_collected
 from airl_mav.core.progress import DRAWING, Progress
@@ -17,13 +17,9 @@ from airl_mav.rehearsal.run_folder import LoadedRun, load
 from airl_mav.report import run_tables
 from airl_mav.report.arenas import arenas_of, vehicle_of
 from airl_mav.report.conduct import conduct_table
-from airl_mav.report.document import print_verdict
+from airl_mav.report.document import print_place, print_verdict
 from airl_mav.report.faults import faults_table
-from airl_mav.report.forensics.evidence import ranked
-from airl_mav.report.forensics.worst import EXAMINED
-from airl_mav.report.run_page import build_page
 from airl_mav.report.run_summary import summarize_run
-from airl_mav.report.shown_flights import shown
 from airl_mav.report.table import count_outcomes, print_facts, print_table
 from airl_mav.report.verdict import (
     OverallVerdict,
@@ -63,6 +59,12 @@ def write_report(
     Raises:
         UsageError: The folder holds no run, a file is damaged, or a profile is missing or unusable.
     """
+    # Imported here: the figures take as long to load as ten flights to be flown and judged.
+    from airl_mav.report.forensics.evidence import ranked
+    from airl_mav.report.forensics.worst import EXAMINED
+    from airl_mav.report.run_page import build_page
+    from airl_mav.report.shown_flights import shown
+
     if isinstance(run, Path):
         run = load(run)
     vehicle = vehicle_of(run.info)
@@ -73,14 +75,9 @@ def write_report(
     return page
 
 
-def print_report(
-    run: LoadedRun,
-    console: Console,
-    page: Path | None = None,
-    verdict: OverallVerdict | None = None,
-) -> None:
-    """Print the verdict (None = `verdict_of`), settings, tables and the page's path."""
-    print_verdict((verdict or verdict_of(run)).lines, console)
+def print_report(run: LoadedRun, console: Console, verdict: OverallVerdict) -> None:
+    """Print the verdict, what was flown, and the tables."""
+    print_verdict(verdict.lines, console)
     console.print()
     summary, feeds = summarize_run(run), not run.info.setup.computer_on_ground
     flights = count_outcomes([episode.outcome for episode in run.episodes])
@@ -99,18 +96,42 @@ def print_report(
     for view in views:
         console.print()
         print_table(view, console)
-    if page is not None:
-        console.print()
-        console.print(Text.assemble(("report  ", "dim"), str(page)), soft_wrap=True)
 
 
 def show_report(
-    run: LoadedRun, verdict: OverallVerdict, console: Console, progress: Progress | None = None
+    run: LoadedRun,
+    verdict: OverallVerdict,
+    console: Console,
+    progress: Progress | None = None,
+    *,
+    draw: bool = True,
 ) -> Path | None:
-    """Write and print the report of a run with finished flights; return the page's path or None."""
+    """Print the report of a run, then draw its page and print where it lies.
+
+    Args:
+        run: The run.
+        verdict: Verdict shown first, saved as `verdict.json`.
+        console: Output of verdict and tables.
+        progress: Reports that the page is being drawn.
+        draw: False = print the command that draws the page instead.
+
+    Returns:
+        The path of the page; None = not drawn.
+
+    Raises:
+        UsageError: As of `write_report`, after the tables are printed.
+    """
     progress = progress or Progress()
+    if run.episodes:
+        save_verdict(verdict, run.path)
+    print_report(run, console, verdict)
+    if not run.episodes:
+        return None
+    if not draw:
+        print_place("report", f"airl report {shlex.quote(str(run.path))}", console)
+        return None
     progress.status(DRAWING)
-    page = write_report(run, verdict=verdict) if run.episodes else None
+    page = write_report(run, verdict=verdict)
     progress.status(None)
-    print_report(run, console, page, verdict)
+    print_place("report", page, console)
     return page

@@ -96,7 +96,6 @@ def test_it_flies_what_the_command_flies_and_is_silent(
     scenario = asked(level=level, episodes=1, workers=1)
     run = rehearse(scenario, out=tmp_path / "api")
     assert capfd.readouterr() == ("", "")
-    monkeypatch.setattr("airl_mav.cli.evaluate.show_report", lambda *_: None)
     words = option_words(level=level, arena="no-obstacles", episodes=1, seed=20, workers=1)
     code, text = airl("evaluate", "greedy", *words, "--out", str(tmp_path / "command"))
     assert code == 0

@@ -250,9 +250,10 @@ def test_whoever_is_killed_whenever_every_seed_is_flown_once(
 
 FORKS = """
 import json, os, sys
-from airl_mav.cli import evaluate, main
+from airl_mav.cli import main
+from airl_mav.experiments import evaluate, gym_flier
 from airl_mav.rehearsal import episode_saver
-from airl_mav.report import shown_flights
+from airl_mav.report import run_page, shown_flights
 
 episode_saver.INTERVAL_S, episode_saver.INTERVAL_PER_SAVE = 0.02, 0.0
 shown_flights.MAX_PICTURED = 1
@@ -266,8 +267,6 @@ for script in json.loads(sys.argv.pop(1)):
     print("status", os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]), flush=True)
 """
 """Runs one command line again and again, each time in a new process, without loading it anew."""
-
-NO_TABLES = "evaluate.show_report = lambda *_: None"
 
 
 def evaluate(folder: Path, out: Path, *scripts: str) -> list[int]:
@@ -285,11 +284,12 @@ def test_an_evaluation_dies_at_every_moment_of_saving(tmp_path: Path) -> None:
     """At level gym flights are the same every time: so are runs, killed or not."""
     out, straight = tmp_path / "killed", tmp_path / "straight"
     page = "before(atomic, 'sync', lambda p: p.name == 'report.html.partial')"
-    deadly = [f"{NO_TABLES}\n{KILLER}\n{window}" for window in WINDOWS.values()]
-    deadly.append(f"{KILLER}\n{page}")
-    statuses = evaluate(tmp_path, out, *deadly, "", NO_TABLES)
+    draw = f"sys.argv[1:] = ['report', {str(out)!r}]"
+    deadly = [f"{KILLER}\n{window}" for window in WINDOWS.values()]
+    deadly.append(f"{KILLER}\n{page}\n{draw}")
+    statuses = evaluate(tmp_path, out, *deadly, "", draw)
     assert statuses == [-signal.SIGKILL] * len(deadly) + [0, 0]
-    assert evaluate(tmp_path, straight, NO_TABLES) == [0]
+    assert evaluate(tmp_path, straight, "") == [0]
     assert (out / "report.html").read_text(encoding="utf-8").rstrip().endswith("</html>")
     held = [(path / "episodes.jsonl").read_bytes().splitlines() for path in (out, straight)]
     assert len(held[0]) == 40

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -45,7 +46,7 @@ from tests.support.campaign_kit import same_runs
 from tests.support.command_line import airl, option_words
 from tests.support.linear_policy import ACTIONS, SPEC, weights, write_linear
 from tests.support.ports import choose_ports
-from tests.support.processes import ROOT, wait_until
+from tests.support.processes import ROOT, run_alone, wait_until
 
 EPISODES = 30
 LOCKSTEP = {"level": "lockstep"}
@@ -53,23 +54,13 @@ DENSE: dict[str, Any] = {"arena": ("dense-obstacles",), "episodes": EPISODES, "s
 """Where some flights reach the goal and some do not."""
 
 
-def no_page(run_: LoadedRun, *_: Any, **__: Any) -> Path:
-    """Stand in for `build_page`, where a test looks at the printed table alone."""
-    return run_.path / "report.html"
-
-
-def evaluate(
-    *policies: str | Path, page: bool = False, table: bool = False, **options: Any
-) -> tuple[int, str]:
+def evaluate(*policies: str | Path, page: bool = False, **options: Any) -> tuple[int, str]:
     """Run the command in this process; return exit status and output.
 
-    Pages take longer than flights: without `page` none is made, without `table` none printed.
+    The page of a comparison takes longer than its flights: it is made with `page` alone.
     """
     with ExitStack() as stack:
-        if table:
-            stack.enter_context(patch("airl_mav.report.run_report.build_page", no_page))
-        elif not page:
-            stack.enter_context(patch("airl_mav.cli.evaluate.show_report"))
+        if not page:
             stack.enter_context(
                 patch.object(show, "write_document", lambda _, folder: folder / "matrix.html")
             )
@@ -86,10 +77,19 @@ def _few_pictures() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def greedy(tmp_path_factory: pytest.TempPathFactory) -> tuple[LoadedRun, str]:
-    """`airl evaluate greedy`: the run, and what was printed."""
+    """`airl evaluate greedy` and `airl report`: the run, and what was printed."""
     out = tmp_path_factory.mktemp("greedy") / "run"
-    code, text = evaluate("greedy", page=True, out=out, **DENSE)
+    code, text = evaluate("greedy", out=out, **DENSE)
     assert code == 0
+    assert not list(out.glob("*.png"))
+    tables, command = text.rsplit("\n\nreport  ", 1)
+    # The printed command draws the page and prints the same tables.
+    words = shlex.split(command)
+    assert words == ["airl", "report", str(out)]
+    code, shown = airl(*words[1:], width=100)
+    assert code == 0
+    assert tables.endswith(shown.rsplit("\n\nreport  ", 1)[0])
+    assert shown.endswith(f"report  {out / 'report.html'}\n")
     return load(out), text
 
 
@@ -384,6 +384,24 @@ def test_the_page_says_what_is_modelled_and_shows_no_real_time(
     assert pictured <= {e.index for e in run_.episodes if e.outcome is not Outcome.SUCCESS}
 
 
+def test_a_page_alone_loads_what_draws(tmp_path: Path) -> None:
+    program = """
+import sys
+from airl_mav.cli.options import carry_out
+words = ["--arena", "no-obstacles", "--episodes", "10", "--require", "success >= 50 %"]
+assert carry_out("airl evaluate", "airl_mav.cli.evaluate", ["greedy", *words, "--out", "run"]) == 0
+known = {"matplotlib", "plotly", "jinja2", "scipy.stats", "scipy.optimize", "pybullet", "mavsdk"}
+known |= {"torch", "gymnasium"}
+print("loaded:", *sorted(known & set(sys.modules)))
+assert carry_out("airl report", "airl_mav.cli.report", ["run"]) == 0
+print("loaded:", *sorted({"matplotlib", "jinja2"} & set(sys.modules)))
+"""
+    done = run_alone(program, tmp_path)
+    assert done.returncode == 0, done.stderr
+    loaded = re.findall("^loaded:(.*)$", done.stdout, re.MULTILINE)
+    assert loaded == ["", " jinja2 matplotlib"]
+
+
 def test_a_long_table_is_cut_short_and_says_so(
     greedy: tuple[LoadedRun, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -426,7 +444,8 @@ def test_obstacles_are_drawn_where_all_flights_share_them(
     greedy: tuple[LoadedRun, str], tmp_path: Path
 ) -> None:
     run_, _ = greedy
-    evaluate("greedy", episodes=1, seed=4, page=True, out=tmp_path / "one")
+    evaluate("greedy", episodes=1, seed=4, out=tmp_path / "one")
+    write_report(tmp_path / "one")
 
     def share(folder: Path) -> float:
         with Image.open(folder / "trajectories.png") as image:
@@ -450,10 +469,7 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> LoadedRun:
 SCRIPT = """
 import sys
 from airl_mav.rehearsal import episode_saver
-from airl_mav.report import run_report
 episode_saver.INTERVAL_S, episode_saver.MAX_WAITING = 60.0, 5
-# The table is printed; the page takes longer than the flights.
-run_report.build_page = lambda run, *_, **__: run.path / "report.html"
 from airl_mav.cli.main import main
 main()
 """
@@ -546,12 +562,23 @@ def test_what_is_finished_is_shown_again_and_not_flown(
 ) -> None:
     run_, text = greedy
     monkeypatch.setattr(gym_flier, "fly_seeds", None)
-    before = {p.name: p.read_bytes() for p in run_.path.iterdir() if p.suffix != ".html"}
-    code, again = evaluate("greedy", table=True, slots=3, out=run_.path, **DENSE)
+    before = {p.name: p.read_bytes() for p in run_.path.iterdir()}
+    code, again = evaluate("greedy", slots=3, out=run_.path, **DENSE)
     assert code == 0
-    assert again.endswith(text)
-    after = {p.name: p.read_bytes() for p in run_.path.iterdir() if p.suffix != ".html"}
+    tables, page = again.rsplit("\n\nreport  ", 1)
+    assert tables.endswith(text.rsplit("\n\nreport  ", 1)[0])
+    # There is a page: it is drawn again.
+    assert page == f"{run_.path / 'report.html'}\n"
+    after = {p.name: p.read_bytes() for p in run_.path.iterdir()}
     assert before == after
+
+
+def test_a_page_says_what_was_required_last(greedy: tuple[LoadedRun, str], tmp_path: Path) -> None:
+    shutil.copytree(greedy[0].path, tmp_path / "run")
+    code, _ = evaluate("greedy", require="success >= 99 %", out=tmp_path / "run", **DENSE)
+    assert code == 3
+    page = Page((tmp_path / "run" / "report.html").read_text(encoding="utf-8"))
+    assert "does not meet: success >= 99 %" in page.words
 
 
 @pytest.mark.parametrize(
@@ -801,7 +828,7 @@ def test_level_sitl_flies(linear: Path, tmp_path: Path) -> None:
     options: dict[str, Any] = {f"{name}_port": port for name, port in ports.items()}
     options |= {"arena": "no-obstacles", "level": "sitl", "speed": 4.0, "no_validity": True}
     out = tmp_path / "run"
-    code, text = evaluate(linear, episodes=1, seed=10, table=True, out=out, **options)
+    code, text = evaluate(linear, episodes=1, seed=10, out=out, **options)
     assert code == 0
     assert "success rate" in text
     (episode,) = load(out).episodes

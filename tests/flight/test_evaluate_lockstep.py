@@ -28,6 +28,7 @@ from airl_mav.policy.card import load_card
 from airl_mav.rehearsal.run_folder import FlownEpisode, LoadedRun, load
 from airl_mav.report import shown_flights
 from airl_mav.report.comparison import show
+from airl_mav.report.run_report import write_report
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 from tests.flight.test_evaluate import Page
@@ -49,7 +50,6 @@ def evaluate(*policies: str | Path, page: bool = False, **options: Any) -> tuple
     settings = {"arena": ARENA, "episodes": EPISODES, "seed": SEED, "level": "lockstep"}
     with ExitStack() as stack:
         if not page:
-            stack.enter_context(patch("airl_mav.cli.evaluate.show_report"))
             stack.enter_context(
                 patch.object(show, "write_document", lambda _, folder: folder / "matrix.html")
             )
@@ -68,7 +68,8 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> tuple[LoadedRun, str]
     """One worker, undisturbed; and what was printed."""
     out = tmp_path_factory.mktemp("lockstep") / "one"
     with page_alone():
-        code, text = evaluate("greedy", workers=1, page=True, out=out)
+        code, text = evaluate("greedy", workers=1, out=out)
+        write_report(out)
     assert code == 0
     return load(out), text
 
@@ -155,10 +156,9 @@ def test_a_table_of_arenas(reference: tuple[LoadedRun, str], tmp_path: Path) -> 
 # --- what it survives
 
 SCRIPT = """
-from airl_mav.cli import evaluate, main
+from airl_mav.cli import main
 from airl_mav.rehearsal import episode_saver
 episode_saver.INTERVAL_S, episode_saver.INTERVAL_PER_SAVE = 0.05, 0.0
-evaluate.show_report = lambda *_: None  # takes longer than the flights
 main.main()
 """
 

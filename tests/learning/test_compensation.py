@@ -380,8 +380,7 @@ def test_one_flight_in_lockstep_is_the_same_twice() -> None:
 )
 def test_evaluate_flies_as_it_is_told(words: list[str], between: str, tmp_path: Path) -> None:
     asked = ["--level", "gym", "--episodes", "1", "--out", str(tmp_path / "out"), *words]
-    with patch("airl_mav.cli.evaluate.show_report"):
-        code, _ = airl("evaluate", "static-obstacles", *asked)
+    code, _ = airl("evaluate", "static-obstacles", *asked)
     assert code == 0
     run = json.loads(next(tmp_path.rglob("run.json")).read_text())
     assert run["setup"]["between_commands"] == between

@@ -10,7 +10,6 @@ from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import pytest
 
@@ -120,9 +119,8 @@ def test_a_sweep_trains_judges_and_tells_all(undisturbed: Path) -> None:
 def test_a_network_is_judged_as_airl_evaluate_judges_it(undisturbed: Path) -> None:
     name, result = max(outcome(undisturbed).items(), key=lambda item: item[1]["successes"])
     words = ["--arena", "no-obstacles", "--episodes", "20", "--seed", "1"]
-    with patch("airl_mav.cli.evaluate.show_report"):  # Figures take longer than flights.
-        policy, out = undisturbed / "out" / name / "policy", undisturbed / "judged"
-        assert airl("evaluate", str(policy), *words, "--out", str(out))[0] == 0
+    policy, out = undisturbed / "out" / name / "policy", undisturbed / "judged"
+    assert airl("evaluate", str(policy), *words, "--out", str(out))[0] == 0
     lines = (undisturbed / "judged" / "episodes.jsonl").read_text(encoding="utf-8").splitlines()
     flown = [json.loads(line) for line in lines]
     good = [each["quality"] for each in flown if each["outcome"] == "success"]

@@ -10,7 +10,6 @@ import sys
 import time
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -179,7 +178,7 @@ def test_programs_read_lines(short: Path, tmp_path: Path) -> None:
     assert [line.split()[0] for line in text.splitlines()] == ["best", "policy", "folder"]
     # What was exported flies through MAVSDK, well or not.
     words = option_words(level="lockstep", episodes=1, workers=1, time_limit_s=5.0)
-    with flown_here(), patch("airl_mav.cli.evaluate.show_report"):
+    with flown_here():
         code, _ = airl("evaluate", str(out / "policy"), *words, "--out", str(tmp_path / "flight"))
     assert code == 0
     flown = load(tmp_path / "flight")

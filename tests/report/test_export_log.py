@@ -45,8 +45,7 @@ FLU_FROM_FRD = np.diag([1.0, -1.0, -1.0])
 
 
 def fly(out: Path, *words: str, **asked: Any) -> Path:
-    with patch("airl_mav.cli.evaluate.show_report"):
-        code, _ = airl("evaluate", "greedy", *words, *option_words(out=out, **asked))
+    code, _ = airl("evaluate", "greedy", *words, *option_words(out=out, **asked))
     assert code == 0
     return out
 

@@ -28,7 +28,8 @@ sys.meta_path.insert(0, Absent())
 FLY = """
 from airl_mav.cli.options import carry_out
 words = ["--arena", "no-obstacles", "--episodes", "1", "--out", "run"]
-raise SystemExit(carry_out("airl evaluate", "airl_mav.cli.evaluate", ["greedy", *words]))
+assert carry_out("airl evaluate", "airl_mav.cli.evaluate", ["greedy", *words]) == 0
+raise SystemExit(carry_out("airl report", "airl_mav.cli.report", ["run"]))
 """
 
 COMPARE = """

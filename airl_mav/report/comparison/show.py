@@ -10,18 +10,18 @@ from typing import Any
 from rich.console import Console
 
 from airl_mav.core.errors import UsageError
+from airl_mav.core.progress import DRAWING, Progress
 from airl_mav.flight.requirements import Requirement, find, settle
 from airl_mav.flight.statistics import reached_goals
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report.comparison import degradation, gap, ladder, matrix, model, runs
 from airl_mav.report.comparison.build import load_runs
-from airl_mav.report.document import Document, print_document, write_document
+from airl_mav.report.document import Document, print_document, print_place, write_document
 from airl_mav.report.verdict import (
     OverallVerdict,
     invalid_flights,
     join_verdicts,
     judge_run,
-    load_verdict,
     requirements_of,
     save_verdict,
     unchecked,
@@ -145,13 +145,20 @@ def write_comparison(
     Raises:
         UsageError: The folder cannot be written.
     """
+    return write_document(_saved(comparison, loaded, folder, verdict), folder)
+
+
+def _saved(
+    comparison: model.Comparison, loaded: Runs, folder: Path, verdict: OverallVerdict | None
+) -> Document:
+    """Write the figures and the verdict of a comparison; return its document."""
     verdict = verdict or judge_comparison(comparison, loaded, requirements_of(folder))
     try:
         model.save_comparison(comparison, folder)
         save_verdict(verdict, folder)
     except OSError as error:
         raise UsageError(f"{folder}: {error.strerror}") from None
-    return write_document(comparison_to_document(comparison, loaded, folder, verdict), folder)
+    return comparison_to_document(comparison, loaded, folder, verdict)
 
 
 def comparison_to_document(
@@ -162,19 +169,20 @@ def comparison_to_document(
     return replace(document, answers=verdict.lines, status=verdict.status)
 
 
-def print_comparison(
-    comparison: model.Comparison, loaded: Runs, console: Console, page: Path
-) -> None:
-    """Print the verdict, the tables and where the page lies."""
-    folder = page.parent
-    document = comparison_to_document(comparison, loaded, folder, load_verdict(folder))
-    print_document(document, console, page)
-
-
 def show_comparison(
-    comparison: model.Comparison, loaded: Runs, folder: Path, console: Console
+    comparison: model.Comparison,
+    loaded: Runs,
+    folder: Path,
+    console: Console,
+    verdict: OverallVerdict | None = None,
+    progress: Progress | None = None,
 ) -> Path:
-    """Write a comparison's files and print it; return the path of the page."""
-    page = write_comparison(comparison, loaded, folder)
-    print_comparison(comparison, loaded, console, page)
+    """Print a comparison, then draw its page and print where it lies; as `write_comparison`."""
+    progress = progress or Progress()
+    document = _saved(comparison, loaded, folder, verdict)
+    print_document(document, console)
+    progress.status(DRAWING)
+    page = write_document(document, folder)
+    progress.status(None)
+    print_place(document.name, page, console)
     return page
