@@ -11,7 +11,6 @@ from rich.console import Console
 from rich.table import Table
 
 from airl_mav import __version__
-from airl_mav.cli.options import run_command
 from airl_mav.core.console import new_console
 from airl_mav.core.errors import EXIT_USAGE
 
@@ -70,6 +69,9 @@ def main(words: Sequence[str] | None = None) -> NoReturn:
             f"error: airl {name}: no such command; {hint}", style="red"
         )
         sys.exit(EXIT_USAGE)
+    # Imported here: the list of commands needs no models of their options.
+    from airl_mav.cli.options import run_command
+
     run_command(f"airl {name}", MODULES.get(name, f"airl_mav.cli.{name}"), rest)
 
 

@@ -18,9 +18,6 @@ from airl_mav.core.fields import ProfileModel
 from airl_mav.rehearsal.run_folder import RUN_FILE, load
 from airl_mav.report.arenas import trust_arenas
 from airl_mav.report.comparison.model import comparison_file, kind_of
-from airl_mav.report.comparison.runs import compare_folders
-from airl_mav.report.comparison.show import rebuild_comparison, show_comparison
-from airl_mav.report.run_report import show_report, verdict_of
 
 
 class ReportOptions(ProfileModel):
@@ -86,14 +83,22 @@ def run(options: ReportOptions, console: Console | None = None) -> int:
         if value:
             raise FieldError(field, f"{value}", "with two runs or more")
     if kind_of(first) is None:
+        # Imported here and below: options need no figures.
+        from airl_mav.report.run_report import show_report, verdict_of
+
         loaded = load(first)
         show_report(loaded, verdict_of(loaded), console)
     else:
+        from airl_mav.report.comparison.show import rebuild_comparison, show_comparison
+
         show_comparison(*rebuild_comparison(first), first, console)
     return 0
 
 
 def _compare(options: ReportOptions, console: Console) -> int:
+    from airl_mav.report.comparison.runs import compare_folders
+    from airl_mav.report.comparison.show import show_comparison
+
     out = options.out or Path("runs") / f"{utc_now():%Y%m%dT%H%M%SZ}-compare"
     if (out / RUN_FILE).exists():
         raise FieldError("out", f"{out}", "another folder: it holds a run")

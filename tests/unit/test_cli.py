@@ -106,12 +106,23 @@ def test_the_script_is_the_subcommand(
     assert err == "error: --seed -1: accepted: 0 <= value <= 2147483648\n"
 
 
-def test_help_loads_no_simulator_and_no_figures() -> None:
+@pytest.mark.parametrize(
+    ("words", "heavy"),
+    [
+        (["--help"], {"pydantic", "numpy"}),
+        *(
+            ([name, "--help"], {"pybullet", "numba", "matplotlib", "jinja2", "torch", "mavsdk"})
+            for name in ("sitl", "evaluate", "report")
+        ),
+    ],
+)
+def test_help_loads_no_simulator_and_no_figures(words: list[str], heavy: set[str]) -> None:
     code = (
-        "import sys; from airl_mav.cli.main import main\n"
-        "try: main(['sitl', '--help'])\n"
+        "import sys; from airl_mav.cli.entry import airl\n"
+        f"sys.argv[1:] = {words}\n"
+        "try: airl()\n"
         "except SystemExit: pass\n"
-        "heavy = {'pybullet', 'numba', 'matplotlib', 'torch', 'mavsdk'} & set(sys.modules)\n"
+        f"heavy = {heavy} & set(sys.modules)\n"
         "assert not heavy, heavy\n"
     )
     done = subprocess.run(
