@@ -1,7 +1,7 @@
-"""Compile every kernel before the first tick that counts.
+"""Load or compile every kernel before the first tick that counts: a tick has 4 ms.
 
-The first start after an install compiles (tens of seconds); later ones load the compiled code from
-disk. Either way it must not happen in flight: a tick has 4 ms.
+The first start after an install compiles, in the processes of `airl_mav.core.first_start`; later
+ones load the compiled code from disk.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from collections.abc import Callable
 import numpy as np
 
 from airl_mav.arena.generate import generate
+from airl_mav.arena.geometry import Arena
 from airl_mav.control.controller import Controller
 from airl_mav.control.demand import AttitudeDemand, RateDemand, TrajectoryDemand
 from airl_mav.control.gains import Gains
@@ -29,6 +30,7 @@ from firmware_sim.interfaces import DistanceReading
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from firmware_sim.mavlink.link import gcs_link, onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
+from firmware_sim.plant.camera_server import SimulatedCamera
 from firmware_sim.simulation import EpisodeSetup, Simulation, builtin_autopilot
 
 LONGEST_TICKS = 1300
@@ -46,8 +48,31 @@ HOVER = np.array([0.0, 0.0, -GRAVITY_M_S2])
 
 def warm_up(vehicle: VehicleProfile, plant: PlantName = DEFAULT_PLANT) -> None:
     """Fly a moment in simulated time, through everything that a real flight on a plant uses."""
+    _fly(vehicle, plant, _arena(vehicle))
+
+
+def compile_flight(vehicle: str, plant: PlantName) -> None:
+    """Compile the whole of it, for a vehicle profile in JSON."""
+    warm_up(VehicleProfile.model_validate_json(vehicle), plant)
+
+
+def compile_ticks(vehicle: str, plant: PlantName) -> None:
+    """Compile plant, flight controller and MAVLink streams, without arena and cameras."""
+    _fly(VehicleProfile.model_validate_json(vehicle), plant, None)
+
+
+def compile_camera(vehicle: str) -> None:
+    """Compile arenas and cameras."""
+    profile = VehicleProfile.model_validate_json(vehicle)
+    SimulatedCamera(profile.camera, _arena(profile), further=profile.cameras)
+
+
+def _arena(vehicle: VehicleProfile) -> Arena:
     spec = load_profile("arenas", "dynamic-obstacles", ArenaSpec)
-    arena = generate(spec, 1, name="warm-up", vehicle_width_m=vehicle.body.width_m)
+    return generate(spec, 1, name="warm-up", vehicle_width_m=vehicle.body.width_m)
+
+
+def _fly(vehicle: VehicleProfile, plant: PlantName, arena: Arena | None) -> None:
     setup = EpisodeSetup(vehicle, arena, 0, Aircraft(plant=plant))
     autopilot = builtin_autopilot(setup)
     if (origin := vehicle.told_origin) is not None:

@@ -18,6 +18,9 @@ from airl_mav.cli.telling import Telling, Voice
 from airl_mav.cli.viewing import Viewing, view_of
 from airl_mav.core.compiling import COMPILING, heard_compiling
 from airl_mav.core.errors import EXIT_INTERRUPTED, FieldError, UsageError
+from airl_mav.core.first_start import compile_first
+from airl_mav.profiles.vehicle import load_vehicle
+from airl_mav.scenario.compile_plans import vectorized_plan
 from airl_mav.training.progress import Exported, TrainingBar
 from airl_mav.training.request import TrainRequest
 
@@ -78,6 +81,9 @@ def run(
         if viewer is not None:
             progress.note(f"view       {viewer.url}")
         try:
+            vehicle = load_vehicle(config.environment.vehicle)
+            kind = config.environment.camera.of(vehicle.camera).kind
+            compile_first([vectorized_plan(kind, recorded=False)], progress)
             with heard_compiling(lambda begins: progress.status(COMPILING if begins else None)):
                 result = train(
                     config,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -56,15 +56,21 @@ def _read(file: Path) -> tuple[str, tuple[Path, ...]]:
     return hashlib.sha256(text.encode()).hexdigest(), tuple(sorted(files))
 
 
-@cache
-def _closure_digest(file: Path) -> str:
-    """Return a digest of a source file and all that it imports, directly or not."""
-    pending, found = [file], dict[Path, str]()
+def _closure(files: Iterable[Path]) -> dict[Path, str]:
+    """Return the digests of source files and all that they import, directly or not."""
+    pending, found = list(files), dict[Path, str]()
     while pending:
         each = pending.pop()
         if each not in found:
             found[each], imported = _read(each)
             pending += imported
+    return found
+
+
+@cache
+def _closure_digest(file: Path) -> str:
+    """Return a digest of a source file and all that it imports, directly or not."""
+    found = _closure([file])
     listed = "".join(sorted(f"{each.name} {digest}\n" for each, digest in found.items()))
     return hashlib.sha256(listed.encode()).hexdigest()[:16]
 
@@ -142,7 +148,17 @@ def large_borrowing_kernel(function: F) -> F:
     return _compiled(function, forceinline=False, counts=False)
 
 
+kernel_files: set[str] = set()
+"""Source files of the kernels loaded so far."""
+
+
+def sources() -> list[Path]:
+    """Return the source files that the kernels loaded so far depend on."""
+    return sorted(_closure(Path(each).resolve() for each in kernel_files))
+
+
 def _compiled(function: F, *, forceinline: bool, counts: bool = True) -> F:
+    kernel_files.add(function.__code__.co_filename)
     options = {"nogil": True, "error_model": "numpy", "forceinline": forceinline, "_nrt": counts}
     with _caching_in(cache_folder(function.__code__.co_filename)):
         return cast(F, njit(cache=True, **options)(function))

@@ -100,6 +100,9 @@ class Progress:
     def tell(self, event: Event) -> None:
         """Tell programs what has happened."""
 
+    def line(self, text: str) -> None:
+        """Print how far long work is, where no bar can be drawn."""
+
     def note(self, text: str, style: str | None = None) -> None:
         """Print a line for a person; it stays when the bars are gone.
 
@@ -165,6 +168,11 @@ class RichProgress(Progress):
     def watch(self, text: str) -> None:
         """Draw what is seen now below the bars; see `Progress`."""
         self._bars.say(text)
+
+    def line(self, text: str) -> None:
+        """Print a line without a terminal; see `Progress`."""
+        if not self._console.is_interactive:
+            self.note(text)
 
     def note(self, text: str, style: str | None = None) -> None:
         """Print a line; see `Progress`."""

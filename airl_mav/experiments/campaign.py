@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 
 from airl_mav.core.compiling import COMPILING
+from airl_mav.core.first_start import compile_first
 from airl_mav.core.progress import Progress
 from airl_mav.experiments.executors import Executor, Stop, WorkerError, never
 from airl_mav.experiments.flier import Flier, FlyEpisodes
@@ -22,6 +23,7 @@ from airl_mav.rehearsal import run_folder
 from airl_mav.rehearsal.episode_saver import EpisodeSaver
 from airl_mav.rehearsal.lock import locked
 from airl_mav.rehearsal.tally import Tally
+from airl_mav.scenario.compile_plans import plan_of
 from airl_mav.scenario.resolved import PlannedEpisode, ResolvedScenario
 
 
@@ -304,6 +306,7 @@ def _run(
                 if not left:
                     close(flying)
                     continue
+                compile_first([plan_of(cell.scenario)], progress, stop)
                 size = len(left)
                 if not executor.streams:
                     size = cell.flier.episodes_per_job(len(left), executor.workers)

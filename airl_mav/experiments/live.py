@@ -11,6 +11,7 @@ from typing import Literal
 
 from airl_mav.core.cpu_quota import remove_left
 from airl_mav.core.errors import EXIT_BROKEN, EXIT_INTERRUPTED, FieldError, UsageError
+from airl_mav.core.first_start import compile_first
 from airl_mav.core.progress import Progress
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.lockstep.turns import LockstepError
@@ -19,6 +20,7 @@ from airl_mav.rehearsal.progress import LiveObserver, Observer
 from airl_mav.rehearsal.rehearsal import Rehearsal, RehearsalError
 from airl_mav.rehearsal.run_folder import RUN_FILE, open_folder
 from airl_mav.rehearsal.signals import terminated_as_interrupted
+from airl_mav.scenario.compile_plans import plan_of
 from airl_mav.scenario.resolved import ResolvedScenario
 from airl_mav.view.ends import ViewEnds, ViewRequest
 from firmware_sim.external.programs import check_program
@@ -93,6 +95,8 @@ def fly_live(
         ended: Ended = "complete"
         problem = ""
         try:
+            # No process waits for another one meanwhile.
+            compile_first([plan_of(scenario)], progress)
             if view is not None:
                 ends, observer = held.enter_context(_watched(scenario, view, live, progress))
             if asked.level == "lockstep":

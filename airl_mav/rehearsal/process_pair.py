@@ -29,7 +29,7 @@ MODULES = {
 """What each process runs."""
 
 READY_TIMEOUT_S = 180.0
-"""The first start after an install compiles the kernels [wall s]."""
+"""Maximum time until both are ready, without that of compiling kernels [wall s]."""
 
 REPLY_TIMEOUT_S = 30.0
 """Longest wait for an answer of a healthy process [wall s]."""
@@ -151,16 +151,18 @@ class ProcessPair:
                 name, module, log, self._events, keeps=keeps, environment=place
             )
             child.send(begin)
-        ready: set[str] = set()
+        ready, compiles = set[str](), set[str]()
 
         def note(name: str, event: Event) -> bool:
             if isinstance(event, Ready):
                 ready.add(name)
-            elif isinstance(event, Compiling) and event.begins:
-                compiling()
+            elif isinstance(event, Compiling):
+                (compiles.add if event.begins else compiles.discard)(name)
+                if event.begins:
+                    compiling()
             return len(ready) == len(self._children)
 
-        self.pump(note, READY_TIMEOUT_S, "both processes to be ready")
+        self.pump(note, READY_TIMEOUT_S, "both processes to be ready", lambda: bool(compiles))
 
     def stop(self) -> None:
         """End both processes; returns when they are gone."""
@@ -240,21 +242,32 @@ class ProcessPair:
         self.pump(take, limit_s, f"the event {kind.__name__!r}")
         return found[0]
 
-    def pump(self, take: Callable[[str, Event], bool], timeout_s: float, what: str) -> None:
+    def pump(
+        self,
+        take: Callable[[str, Event], bool],
+        timeout_s: float,
+        what: str,
+        paused: Callable[[], bool] = lambda: False,
+    ) -> None:
         """Feed events to `take` until it returns True.
 
         Args:
             take: Gets the name of a process and what it says.
             timeout_s: Longest wait [wall s].
             what: What is waited for, in words.
+            paused: Whether the time does not count at present: a process compiles kernels.
 
         Raises:
             UsageError: A process says that its input cannot be used.
             LostError: A process died or failed, or the time is over.
         """
-        deadline = WallClock()
+        since = WallClock()
+        paused_us = before_us = 0
         while True:
-            left_s = timeout_s - deadline.time_us() / US_PER_S
+            now_us = since.time_us()
+            paused_us += now_us - before_us if paused() else 0
+            before_us = now_us
+            left_s = timeout_s - (now_us - paused_us) / US_PER_S
             if left_s <= 0.0:
                 raise LostError(f"gave up waiting for {what} after {timeout_s:.0f} s")
             try:

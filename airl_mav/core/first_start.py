@@ -1,0 +1,301 @@
+"""Compilation of kernels before the first start: a step of its own, in processes side by side.
+
+A plan names functions that use the kernels of a command. Each runs in a process of its own, as many
+at a time as there are cores; what they compile stays in numba's cache, function by function, so
+that an interrupted step resumes where it ended. A record of the source files marks a plan as done.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import queue
+import sys
+import tempfile
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from airl_mav.core.cache import writable_folder
+from airl_mav.core.child_process import ChildProcess, Exited
+from airl_mav.core.clock import WallClock
+from airl_mav.core.constants import US_PER_S
+from airl_mav.core.files import replace_file
+from airl_mav.core.progress import Bar, Progress
+from airl_mav.core.provenance import usable_cores
+
+LABEL = "compiling kernels (first start only)"
+
+POLL_S = 0.1
+"""Interval between two checks for Ctrl-C [wall s]."""
+
+LINE_EVERY_S = 10.0
+"""Interval between two lines where no bar can be drawn [wall s]."""
+
+
+@dataclass(frozen=True)
+class CompileJob:
+    """A function that uses kernels, for a process of its own."""
+
+    function: str
+    """Module and name, as `package.module:function`."""
+    arguments: Mapping[str, Any]
+    """Keyword arguments, as JSON has them."""
+    kernels: int
+    """Number of kernels compiled with an empty cache; progress alone depends on it."""
+
+
+@dataclass(frozen=True)
+class CompilePlan:
+    """What a command compiles before its first flight."""
+
+    family: str
+    """Plans of a family share most kernels: what others of it need is compiled by `whole` alone."""
+    variant: str
+    """Names it within the family; plans that need different kernels have different variants."""
+    parts: tuple[CompileJob, ...]
+    """Jobs that run side by side; they share few kernels."""
+    whole: CompileJob
+    """Runs after the parts and compiles what they left; uses every kernel of the plan."""
+
+    def record(self, folder: Path) -> Path:
+        """Return the file that marks the plan as done."""
+        return folder / f"{self.family}-{self.variant}.json"
+
+
+def compile_first(
+    plans: Sequence[CompilePlan],
+    progress: Progress | None = None,
+    stop: Callable[[], bool] = lambda: False,
+    workers: int | None = None,
+) -> None:
+    """Compile the kernels of plans, unless that has been done.
+
+    Takes as long as it takes. Nothing is shown where every kernel is in the cache.
+
+    Args:
+        plans: What is needed.
+        progress: Where to show it.
+        stop: Checked several times a second; True ends the step.
+        workers: Number of processes at a time; None: one a core.
+
+    Raises:
+        KeyboardInterrupt: Ctrl-C; what is compiled stays, and the next start resumes.
+    """
+    chosen = os.environ.get("NUMBA_CACHE_DIR")
+    folder = Path(chosen) if chosen else writable_folder("first-start")
+    if folder is None:
+        return  # Nothing can be kept.
+    missing = [plan for plan in plans if not _is_done(plan.record(folder))]
+    if not missing:
+        return
+    progress = progress or Progress()
+    folder.mkdir(parents=True, exist_ok=True)
+    with _locked(folder, progress, stop):
+        for plan in missing:
+            if _is_done(plan.record(folder)):
+                continue
+            if stop():
+                return
+            parts = plan.parts
+            if any(map(_is_done, folder.glob(f"{plan.family}-*.json"))):
+                parts = ()
+            with tempfile.TemporaryDirectory(prefix="airl-compiling-") as scratch:
+                step = _Step(progress, stop, workers or usable_cores(), Path(scratch))
+                files = step.run(parts, plan.whole)
+            if files is not None:
+                _record(plan.record(folder), files)
+
+
+# --- the record
+
+
+def _is_done(path: Path) -> bool:
+    """Return whether a record is of the present sources and of such a machine."""
+    try:
+        record = json.loads(path.read_bytes())
+        return bool(
+            record["machine"] == _machine()
+            and all(_stamp(name) == stamp for name, stamp in record["files"].items())
+        )
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return False
+
+
+def _record(path: Path, files: Sequence[str]) -> None:
+    record = {"machine": _machine(), "files": {name: _stamp(name) for name in files}}
+    with suppress(OSError):
+        replace_file(path, json.dumps(record).encode())
+
+
+def _stamp(name: str) -> list[int]:
+    """Return size and time of a file: numba compiles again when either changes."""
+    stat = os.stat(name)  # noqa: PTH116 - three hundred of them at every start
+    return [stat.st_size, stat.st_mtime_ns]
+
+
+def _machine() -> str:
+    """Return what else numba's cache depends on: interpreter, and the processor as Linux has it."""
+    with suppress(OSError), open("/proc/cpuinfo", "rb", buffering=0) as file:  # noqa: PTH123
+        for line in file.read(2048).decode(errors="replace").splitlines():
+            if line.startswith("model name"):
+                return f"{sys.version} {line}"
+    return sys.version
+
+
+@contextmanager
+def _locked(folder: Path, progress: Progress, stop: Callable[[], bool]) -> Iterator[None]:
+    """Let one program at a time compile; the others wait, and then find the code in the cache."""
+    clock, said = WallClock(), False
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        while not stop():
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                if not said:
+                    progress.status("waiting for another program that compiles kernels")
+                said = True
+                clock.sleep_until(clock.time_us() + round(POLL_S * US_PER_S))
+            except OSError:
+                break  # Some network file systems have no locks: both compile.
+            else:
+                break
+        if said:
+            progress.status(None)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+# --- the step
+
+
+@dataclass
+class _Running:
+    """A job in its process."""
+
+    job: CompileJob
+    process: ChildProcess
+    reader: threading.Thread | None = None
+    """Reads what it prints."""
+    count: int = 0
+    """Kernels compiled so far."""
+
+
+class _Step:
+    """Runs the jobs of one plan."""
+
+    def __init__(
+        self, progress: Progress, stop: Callable[[], bool], workers: int, scratch: Path
+    ) -> None:
+        self._progress, self._stop = progress, stop
+        self._workers, self._scratch = workers, scratch
+        self._events: queue.Queue[tuple[_Running, Mapping[str, Any] | Exited]] = queue.Queue()
+        self._running: list[_Running] = []
+        self._total = 0
+        self._ended = 0
+        """Kernels of the jobs that have ended, compiled or found in the cache."""
+        self._files: list[str] = []
+        """Those of the job that ended last."""
+        self._failed = False
+        self._clock = WallClock()
+        self._line_us: int | None = None
+        """When the next line is due; None: nothing is compiled yet."""
+        self._bar: Bar | None = None
+
+    def run(self, parts: Sequence[CompileJob], whole: CompileJob) -> list[str] | None:
+        """Run all jobs; return the source files that the kernels depend on, None if one failed."""
+        self._total = sum(job.kernels for job in (*parts, whole))
+        try:
+            done = self._run_all(parts) and self._run_all([whole])
+        finally:
+            for each in self._running:
+                each.process.kill()  # numba replaces files as a whole: none is left in part.
+                _clear(each)
+            if self._bar is not None:
+                self._bar.close()
+        if not done or not self._files:
+            return None
+        if self._bar is not None:
+            self._progress.line(f"kernels compiled in {self._elapsed_s():.0f} s")
+        return self._files
+
+    def _run_all(self, jobs: Sequence[CompileJob]) -> bool:
+        waiting = list(jobs)
+        while (waiting or self._running) and not self._failed:
+            while waiting and len(self._running) < self._workers:
+                self._start(waiting.pop(0))
+            if self._stop():
+                return False
+            with suppress(queue.Empty):
+                self._take(*self._events.get(timeout=POLL_S))
+            self._show()
+        return not self._failed
+
+    def _start(self, job: CompileJob) -> None:
+        process = ChildProcess(
+            [sys.executable, "-m", "airl_mav.core.compile_process"],
+            self._scratch / "log.txt",
+            capture_stdout=True,
+        )
+        running = _Running(job, process)
+        running.reader = threading.Thread(target=self._read, args=(running,), daemon=True)
+        self._running.append(running)
+        if process.stdin is not None:
+            request = {"function": job.function, "arguments": dict(job.arguments)}
+            with suppress(BrokenPipeError):  # Its end is reported.
+                process.stdin.write(json.dumps(request).encode() + b"\n")
+                process.stdin.flush()
+        running.reader.start()
+
+    def _read(self, running: _Running) -> None:
+        if running.process.stdout is not None:
+            with running.process.stdout as lines:
+                for line in lines:
+                    with suppress(ValueError):  # Printed by a library.
+                        self._events.put((running, json.loads(line)))
+        self._events.put((running, running.process.wait()))
+
+    def _take(self, running: _Running, event: Mapping[str, Any] | Exited) -> None:
+        if isinstance(event, Exited):
+            self._running.remove(running)
+            _clear(running)
+            self._ended += max(running.count, running.job.kernels)
+            if event.code:
+                self._failed = True
+                tail = running.process.log_tail().splitlines()[-1:]
+                self._progress.note(
+                    f"kernels are not compiled ahead: {': '.join([str(event), *tail])}", "yellow"
+                )
+        elif "files" in event:
+            self._files = event["files"]
+        elif self._line_us is None:  # The first kernel that is not in the cache.
+            self._bar = self._progress.bar(LABEL, self._total, unit="kernels")
+            self._line_us = self._clock.time_us()
+        elif "compiled" in event:
+            running.count += 1
+
+    def _show(self) -> None:
+        if self._bar is None or self._line_us is None:
+            return
+        count = self._ended + sum(each.count for each in self._running)
+        self._total = max(count, self._total)
+        self._bar.update(completed=count, total=self._total)
+        if self._clock.time_us() >= self._line_us:
+            self._line_us += round(LINE_EVERY_S * US_PER_S)
+            self._progress.line(f"{LABEL}: {count} of {self._total}, {self._elapsed_s():.0f} s")
+
+    def _elapsed_s(self) -> float:
+        return self._clock.time_us() / US_PER_S
+
+
+def _clear(running: _Running) -> None:
+    """Close the pipes of a job that has ended or is about to."""
+    running.process.stop()
+    if running.reader is not None and running.reader.ident is not None:
+        running.reader.join()

@@ -1,0 +1,54 @@
+"""What commands compile before their first flight. Light to import: functions are named only."""
+
+from __future__ import annotations
+
+from airl_mav.core.first_start import CompileJob, CompilePlan
+from airl_mav.profiles.camera_kind import CameraKind
+from airl_mav.profiles.vehicle import VehicleProfile
+from airl_mav.scenario.aircraft import PlantName
+from airl_mav.scenario.resolved import ResolvedScenario
+
+_FLIGHT = "firmware_sim.warm_up"
+_VECTORIZED = "airl_mav.envs.warm_up"
+
+
+def plan_of(scenario: ResolvedScenario) -> CompilePlan:
+    """Return what a scenario needs at its level."""
+    if scenario.level == "gym":
+        return vectorized_plan(scenario.vehicle.camera.kind, recorded=True)
+    return flight_plan(scenario.vehicle, scenario.scenario.plant)
+
+
+def flight_plan(vehicle: VehicleProfile, plant: PlantName) -> CompilePlan:
+    """Return what a vehicle needs at levels sitl and lockstep."""
+    profile = vehicle.model_dump_json()
+    cameras = {each.kind for each in (vehicle.camera, *vehicle.cameras.values())}
+    sensors = {name for name, value in vehicle.sensors if value is not None}
+    return CompilePlan(
+        "flight",
+        "-".join((plant, *sorted(cameras), *sorted(sensors))),
+        (
+            CompileJob(f"{_FLIGHT}:compile_ticks", {"vehicle": profile, "plant": plant}, 172),
+            CompileJob(f"{_FLIGHT}:compile_camera", {"vehicle": profile}, 43),
+        ),
+        CompileJob(f"{_FLIGHT}:compile_flight", {"vehicle": profile, "plant": plant}, 5),
+    )
+
+
+def vectorized_plan(kind: CameraKind, *, recorded: bool) -> CompilePlan:
+    """Return what level gym needs, whose flights are recorded, or a training.
+
+    Args:
+        kind: Of the main camera's images.
+        recorded: Whether flights are recorded.
+    """
+    how = {"recorded": recorded}
+    return CompilePlan(
+        "vectorized",
+        f"{kind}-{'recorded' if recorded else 'training'}",
+        (
+            CompileJob(f"{_VECTORIZED}:compile_images", {"kind": kind}, 49),
+            CompileJob(f"{_VECTORIZED}:compile_dynamics", how, 102),
+        ),
+        CompileJob(f"{_VECTORIZED}:compile_vectorized", {"kind": kind, **how}, 5),
+    )
