@@ -10,9 +10,8 @@ from rich.console import Console
 from airl_mav.cli.options import run_command
 from airl_mav.core.console import new_console
 from airl_mav.core.errors import EXIT_BROKEN
-from airl_mav.core.first_start import compile_first
+from airl_mav.core.first_start import compile_shown
 from airl_mav.core.goals import Goal
-from airl_mav.core.progress import RichProgress
 from airl_mav.lockstep.remote import fly_vehicle_in_lockstep
 from airl_mav.lockstep.turns import LockstepError
 from airl_mav.rehearsal.stand_alone import Listener, aircraft_of, fly_vehicle
@@ -40,12 +39,11 @@ OPTIONS = FirmwareOptions
 def run(options: FirmwareOptions, console: Console | None = None) -> int:
     """Fly for clients until Ctrl-C, or the companion's end in lockstep; return 1 if it was lost."""
     console = console or new_console(soft_wrap=True)
+    vehicle, _ = aircraft_of(options)
+    compile_shown([flight_plan(vehicle, options.plant)])
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
-    vehicle, _ = aircraft_of(options)
-    with RichProgress(console) as progress:
-        compile_first([flight_plan(vehicle, options.plant)], progress, stop.is_set)
     fly = fly_vehicle_in_lockstep if options.lockstep else fly_vehicle
     try:
         fly(options, stop, _listener(options, console))

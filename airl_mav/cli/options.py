@@ -33,6 +33,8 @@ from airl_mav.core.errors import (
     machine_failure,
 )
 from airl_mav.core.fields import range_of, validated
+from airl_mav.core.first_start import shown_by
+from airl_mav.core.progress import RichProgress
 from airl_mav.faults.model import Fault
 from airl_mav.scenario.aircraft import IN_WORDS
 from airl_mav.scenario.file import read_scenario_file
@@ -273,7 +275,9 @@ def carry_out(prog: str, module: str, words: Sequence[str], **more: Any) -> int:
     options = read_options(command.OPTIONS, prog, words)
     check_installed(*getattr(command, "EXTRAS", ()))
     try:
-        return int(command.run(options, **more))
+        # On standard error: programs read standard output.
+        with shown_by(lambda: RichProgress(new_console(stderr=True))):
+            return int(command.run(options, **more))
     except FieldError as error:
         options_model = type(options)
         file = _scenario_file(options_model, words)

@@ -18,7 +18,7 @@ from airl_mav.cli.telling import Telling, Voice
 from airl_mav.cli.viewing import Viewing, view_of
 from airl_mav.core.compiling import COMPILING, heard_compiling
 from airl_mav.core.errors import EXIT_INTERRUPTED, FieldError, UsageError
-from airl_mav.core.first_start import compile_first
+from airl_mav.core.first_start import compile_shown
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.compile_plans import vectorized_plan
 from airl_mav.training.progress import Exported, TrainingBar
@@ -61,6 +61,9 @@ def run(
     voice = Voice(options, "airl train", console)
     show = partial(voice.console.print, soft_wrap=True, highlight=False)
     config = options.configured()
+    vehicle = load_vehicle(config.environment.vehicle)
+    kind = config.environment.camera.of(vehicle.camera).kind
+    compile_shown([vectorized_plan(kind, recorded=False)])
     bound, injections = speed_bound(config.environment), injections_of(config.environment.delay)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     # Imported late: the learner takes two seconds to load, and a typo must not wait for it.
@@ -81,9 +84,6 @@ def run(
         if viewer is not None:
             progress.note(f"view       {viewer.url}")
         try:
-            vehicle = load_vehicle(config.environment.vehicle)
-            kind = config.environment.camera.of(vehicle.camera).kind
-            compile_first([vectorized_plan(kind, recorded=False)], progress)
             with heard_compiling(lambda begins: progress.status(COMPILING if begins else None)):
                 result = train(
                     config,

@@ -15,7 +15,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -86,12 +86,8 @@ def compile_first(
     Raises:
         KeyboardInterrupt: Ctrl-C; what is compiled stays, and the next start resumes.
     """
-    chosen = os.environ.get("NUMBA_CACHE_DIR")
-    folder = Path(chosen) if chosen else writable_folder("first-start")
-    if folder is None:
-        return  # Nothing can be kept.
-    missing = [plan for plan in plans if not _is_done(plan.record(folder))]
-    if not missing:
+    folder, missing = _missing(plans)
+    if folder is None or not missing:
         return
     progress = progress or Progress()
     folder.mkdir(parents=True, exist_ok=True)
@@ -111,7 +107,38 @@ def compile_first(
                 _record(plan.record(folder), files)
 
 
+_show: Callable[[], AbstractContextManager[Progress]] | None = None
+"""Makes what shows the step of the command that runs."""
+
+
+@contextmanager
+def shown_by(show: Callable[[], AbstractContextManager[Progress]]) -> Iterator[None]:
+    """Show with `show` what `compile_shown` compiles meanwhile."""
+    global _show
+    before, _show = _show, show
+    try:
+        yield
+    finally:
+        _show = before
+
+
+def compile_shown(plans: Sequence[CompilePlan]) -> None:
+    """Compile as `compile_first` within `shown_by`; elsewhere do nothing."""
+    if _show is not None and _missing(plans)[1]:
+        with _show() as progress:
+            compile_first(plans, progress)
+
+
 # --- the record
+
+
+def _missing(plans: Sequence[CompilePlan]) -> tuple[Path | None, list[CompilePlan]]:
+    """Return the folder of the records and the plans without one; None: nothing can be kept."""
+    chosen = os.environ.get("NUMBA_CACHE_DIR")
+    folder = Path(chosen) if chosen else writable_folder("first-start")
+    if folder is None:
+        return None, []
+    return folder, [plan for plan in plans if not _is_done(plan.record(folder))]
 
 
 def _is_done(path: Path) -> bool:
@@ -286,8 +313,8 @@ class _Step:
         count = self._ended + sum(each.count for each in self._running)
         self._total = max(count, self._total)
         self._bar.update(completed=count, total=self._total)
-        if self._clock.time_us() >= self._line_us:
-            self._line_us += round(LINE_EVERY_S * US_PER_S)
+        if (now_us := self._clock.time_us()) >= self._line_us:
+            self._line_us = now_us + round(LINE_EVERY_S * US_PER_S)
             self._progress.line(f"{LABEL}: {count} of {self._total}, {self._elapsed_s():.0f} s")
 
     def _elapsed_s(self) -> float:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 from airl_mav.camera.conditions import check_noise, check_renderer
 from airl_mav.core.errors import FieldError
+from airl_mav.core.first_start import compile_shown
 from airl_mav.flight.judge import GOAL_RADIUS_M
 from airl_mav.latency.injection import Injection, without_timing
 from airl_mav.latency.source import select_injection
@@ -20,6 +21,7 @@ from airl_mav.scenario.checks import (
     check_plant,
     check_ports,
 )
+from airl_mav.scenario.compile_plans import plan_of
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.piloting import (
     NATIVE_T2_US,
@@ -79,6 +81,7 @@ def resolve(scenario: Scenario, policy: PolicyInfo | None = None) -> ResolvedSce
         pilot=pilot,
         watchdog=watchdog,
     )
+    compile_shown([plan_of(resolved)])
     # What cannot be flown is better found here than by a process that is already flying.
     goal = resolved.arena_of(scenario.seed).goal_point
     check_goal_height(policy, goal, "arena", scenario.arena)

@@ -12,7 +12,14 @@ import pytest
 from rich.console import Console
 
 from airl_mav.core import kernels
-from airl_mav.core.first_start import LABEL, CompileJob, CompilePlan, compile_first
+from airl_mav.core.first_start import (
+    LABEL,
+    CompileJob,
+    CompilePlan,
+    compile_first,
+    compile_shown,
+    shown_by,
+)
 from airl_mav.core.progress import RichProgress
 
 MODULE = """
@@ -124,3 +131,13 @@ def test_a_failed_job_is_reported_and_leaves_the_rest_to_the_flight(cache: Path)
     Path("fail").touch()
     assert "kernels are not compiled ahead: exit status 1: RuntimeError: no right" in shown()
     assert not list(cache.glob("*.json"))
+
+
+def test_a_command_shows_what_compiles_before_it_begins(cache: Path) -> None:
+    console = Console(file=io.StringIO(), width=120)
+    compile_shown([PLAN])
+    assert not compiled(cache)
+    with shown_by(lambda: RichProgress(console)):
+        compile_shown([PLAN])
+    assert isinstance(console.file, io.StringIO)
+    assert "kernels compiled in" in console.file.getvalue()
