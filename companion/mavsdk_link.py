@@ -21,7 +21,12 @@ from mavsdk.plugins.server_utility import ServerUtility, StatusTextType
 from mavsdk.plugins.telemetry import FlightMode, Telemetry, TelemetryError, TelemetryResult
 
 from airl_mav.core.clock import Clock, WallClock
-from airl_mav.core.constants import UNMEASURED_A, US_PER_S
+from airl_mav.core.constants import (
+    TAKEOFF_REACHED_M,
+    TAKEOFF_REACHED_M_S,
+    UNMEASURED_A,
+    US_PER_S,
+)
 from airl_mav.policy.actions import Attitude
 from airl_mav.policy.observation import Kinematics
 from companion import interfaces
@@ -33,10 +38,6 @@ POLL_S = 0.1
 
 HEALTH_SETTLE_S = 0.5
 """Time that health must be good before arming: more than two of PX4's 5 Hz reports [s]."""
-
-TAKEOFF_REACHED_M = 0.2
-"""The climb is over this close to the take-off altitude [m]: PX4's last decimetres take seconds, as
-its approach halves the rest in 1.4 s."""
 
 OFFBOARD_SETTLE_S = 0.1
 """Wait after the switch to offboard [s]. PX4 acknowledges it before all of its parts know: a
@@ -307,8 +308,8 @@ class MavsdkLink:
         deadline_us = self._deadline(timeout_s)
         while True:
             state = self.kinematics()
-            height = start_down - float(state.position[2])
-            if height > altitude_m - TAKEOFF_REACHED_M and abs(float(state.velocity[2])) < 0.3:
+            height, speed = start_down - float(state.position[2]), abs(float(state.velocity[2]))
+            if height > altitude_m - TAKEOFF_REACHED_M and speed < TAKEOFF_REACHED_M_S:
                 return
             self._check(deadline_us, f"take-off: {height:.1f} m after {timeout_s:g} s", stop)
             self._pause()
@@ -318,6 +319,17 @@ class MavsdkLink:
         self.send_setpoint(interfaces.STOP)
         self._call("offboard", self._offboard.start)
         self._pause(OFFBOARD_SETTLE_S)
+
+    def await_hover(self, altitude_m: float, timeout_s: float, stop: threading.Event) -> None:
+        """Wait until telemetry shows a vehicle that hovers near an altitude above the start.
+
+        The position arrives at 50 Hz, armed and landed state once a second. `stop`, set from
+        outside, ends the wait.
+        """
+        deadline_us = self._deadline(timeout_s)
+        while not -float(self.kinematics().position[2]) > altitude_m / 2:  # NaN before the first
+            self._check(deadline_us, f"not in the air after {timeout_s:g} s", stop)
+            self._pause()
 
     def await_offboard(self, stop: threading.Event) -> None:
         """Send zero velocity until a pilot has switched the vehicle to offboard, or on `stop`.

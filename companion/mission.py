@@ -8,6 +8,7 @@ import threading
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal, TypeAlias
 
 from airl_mav.core.clock import Clock
 from airl_mav.core.errors import FieldError, UsageError
@@ -17,7 +18,7 @@ from airl_mav.latency.stamps import DecisionLog
 from airl_mav.policy.actions import CameraBound, Policy, RigBound
 from airl_mav.prediction.compensator import Compensator
 from airl_mav.scenario.model import LimitSettings, PilotSettings, WatchdogSettings
-from airl_mav.scenario.stand_alone import Start
+from airl_mav.scenario.stand_alone import Start as PilotedStart
 from companion.camera import FrameSource
 from companion.dialects import ARDUPILOT
 from companion.guard import Guard
@@ -30,11 +31,22 @@ from companion.watchdog import Watchdog
 PREPARE_TIMEOUT_S = 10.0
 """How long a flight controller may be silent when a mission begins [wall s]."""
 
+HOVER_TIMEOUT_S = 5.0
 TAKEOFF_TIMEOUT_S = 30.0
 LAND_TIMEOUT_S = 60.0
 
 FRAME_TIMEOUT_S = 5.0
 """How long a camera may take to show a first frame [wall s]."""
+
+
+Start: TypeAlias = PilotedStart | Literal["hover"]
+"""Begin of a mission; hover: in Hold in the air, where the companion enters offboard."""
+
+FIRST_PHASE: dict[Start, str] = {
+    "arm": "arming",
+    "offboard": "waiting for offboard",
+    "hover": "entering offboard",
+}
 
 
 @dataclass(frozen=True)
@@ -90,7 +102,8 @@ def fly_mission(
         compensator: Predicts what the policy sees; None: no prediction.
         mount_pitch_up_rad: Pitch of the camera mount, up [rad].
         mount_yaw_rad: Yaw of the camera mount, right [rad].
-        start: Whether this program arms, takes off and lands, or a pilot hands over in flight.
+        start: Whether this program arms, takes off and lands, a pilot hands over in flight, or the
+            vehicle is in Hold in the air before and after (hover).
         decided: Callback for every decision, called when its setpoint is sent. Must not block.
     """
     watchdog = Watchdog(link, clock, watchdog_settings)
@@ -134,7 +147,7 @@ def fly_mission(
         notes.append(str(limits.ending))
     taken = limits.ending is not None and limits.ending.reason in NOT_OURS
     try:
-        if taken or (start == "offboard" and not navigating):
+        if taken or (start != "arm" and not navigating):
             # Nothing may be repeated into a later switch to offboard, either.
             link.release()
         elif abandon.is_set() or lost or reason == TELEMETRY_FROZEN:
@@ -166,7 +179,7 @@ def _begin(
     progress: Callable[[str], None],
 ) -> None:
     """Return once the vehicle flies our setpoints. Raises LinkError."""
-    progress("arming" if start == "arm" else "waiting for offboard")
+    progress(FIRST_PHASE[start])
     link.prepare(PREPARE_TIMEOUT_S, stop)
     if settings.commands != "velocity" and link.dialect is ARDUPILOT:
         # Its GUIDED mode takes a thrust for a climb rate, unless GUID_OPTIONS says otherwise.
@@ -174,6 +187,10 @@ def _begin(
         raise LinkError(f"the policy commands {words}, which only PX4 flies with its thrust")
     if start == "offboard":
         link.await_offboard(stop)
+        return
+    if start == "hover":
+        link.await_hover(settings.altitude_m, HOVER_TIMEOUT_S, stop)
+        link.enter_offboard()
         return
     link.arm(link.dialect.arm_timeout_s, stop, settings.origin)
     progress("taking off")

@@ -271,9 +271,11 @@ class Firmware:
             self._failing.begin(simulation.faults)
         simulation.tick()
         powered_us = simulation.time_us
+        if setup.hover is not None:
+            setup.hover.fly(simulation)
         self.flight_stack.connect(self._tick_on_the_ground, simulation.plant.truth)
         if simulation.time_us > powered_us:
-            # The time that external firmware took to boot is no part of the episode.
+            # What external firmware took to boot, or a hover start to climb, precedes the episode.
             simulation.begin()
             start_us = simulation.start_us
         self._sockets = self.flight_stack.filenos()

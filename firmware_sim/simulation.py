@@ -26,6 +26,7 @@ from firmware_sim.faults.controller import FailingParts
 from firmware_sim.faults.injection import ClientFaults
 from firmware_sim.faults.timeline import FaultTimeline
 from firmware_sim.flight_controller import FlightController
+from firmware_sim.hover_start import HoverStart
 from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth
 from firmware_sim.plant.camera_server import SimulatedCamera
 from firmware_sim.plant.kinematics import POSITION, QUATERNION, RATES, VELOCITY
@@ -47,6 +48,8 @@ class EpisodeSetup:
     """What was asked of it: wind, spread, sensors, estimator, charge of the battery."""
     computer_w: float = 0.0
     """What the onboard computer draws from the pack [W]."""
+    hover: HoverStart | None = None
+    """How the episode begins in a hover; None = on the ground."""
 
 
 def builtin_autopilot(setup: EpisodeSetup, keeper: Keeper | None = None) -> BuiltinAutopilot:

@@ -50,6 +50,13 @@ TICK_HZ: Final = US_PER_S // TICK_US
 DEG: Final = math.pi / 180.0
 """One degree [rad]."""
 
+TAKEOFF_REACHED_M: Final = 0.2
+"""The climb is over this close to the take-off altitude [m]: PX4's last decimetres take seconds, as
+its approach halves the rest in 1.4 s."""
+
+TAKEOFF_REACHED_M_S: Final = 0.3
+"""Maximum vertical speed at the end of the climb [m/s]."""
+
 MAX_ATTEMPTS: Final = 3
 """A job or a flight whose processes are lost is begun so many times, the first included."""
 Level = Literal["gym", "lockstep", "sitl", "hil", "firmware", "flight"]

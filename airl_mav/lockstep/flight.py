@@ -27,6 +27,7 @@ from airl_mav.lockstep.turns import LockstepError
 from airl_mav.policy.actions import Policy
 from airl_mav.rehearsal.channel import Text
 from airl_mav.rehearsal.episode import faults_of, join_stamps, judged_record, part_of
+from airl_mav.rehearsal.episode_setup import episode_setup
 from airl_mav.rehearsal.progress import Observer
 from airl_mav.rehearsal.run_folder import FIRMWARE_PRINTS, FlownEpisode, RunFolder
 from airl_mav.rehearsal.supervisor import Order, Supervisor
@@ -34,10 +35,10 @@ from airl_mav.rehearsal.true_state import state_of
 from airl_mav.scenario.piloting import TRANSPORT_US
 from airl_mav.scenario.resolved import ResolvedScenario
 from airl_mav.view.ends import ViewEnds
-from companion.mission import MissionResult, check_camera, fly_mission
+from companion.mission import MissionResult, Start, check_camera, fly_mission
 from firmware_sim.autopilot.autopilot_state import Message
 from firmware_sim.flight_controller import FirmwareLostError
-from firmware_sim.simulation import EpisodeSetup, Simulation
+from firmware_sim.simulation import Simulation
 from firmware_sim.warm_up import warm_up
 
 if TYPE_CHECKING:  # A flight that nobody watches need not load it.
@@ -179,6 +180,7 @@ class Flight:
         self.arena = resolved.arena_of(seed)
         """Where it flies."""
         self._goal = self.arena.goal_point
+        self._start: Start = "hover" if resolved.scenario.start == "hover" else "arm"
         self._witnessed = resolved.scenario.firmware == "builtin"
         self._digest = FlightDigest() if self._witnessed else Unwitnessed()
         self._stop = threading.Event()
@@ -202,13 +204,7 @@ class Flight:
             FirmwareLostError: Real firmware was lost.
         """
         resolved = self._resolved
-        setup = EpisodeSetup(
-            resolved.vehicle,
-            self.arena,
-            self._seed,
-            resolved.scenario,
-            resolved.computer.onboard_watts,
-        )
+        setup = episode_setup(resolved, self.arena, self._seed)
         asked = resolved.scenario
         vehicle = real_vehicle(asked, resolved.vehicle, log)
         with ExitStack() as held:
@@ -277,6 +273,7 @@ class Flight:
             compensator=compensator,
             mount_pitch_up_rad=math.radians(resolved.vehicle.camera.pitch_up_deg),
             mount_yaw_rad=math.radians(resolved.vehicle.camera.yaw_deg),
+            start=self._start,
             decided=decided,
         )
 
@@ -307,6 +304,8 @@ class Flight:
 
     def _decided(self, verdict: Verdict) -> None:
         self._observer.phase(verdict.outcome.value, verdict.time_us)
+        if self._start == "hover" and self._lands:
+            self.call_off()
 
     def _hear(self, message: Message) -> None:
         now_us = self._stage.conductor.clock.time_us()

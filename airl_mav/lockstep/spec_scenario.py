@@ -25,6 +25,7 @@ BESIDE = (
     "arena_seed",
     "latency_seed",
     "speed",
+    "start",
 )
 """Fields of a `Scenario` that say what an `EnvironmentSpec` does not."""
 

@@ -128,6 +128,7 @@ class Missions:
                     compensator=carries,
                     mount_pitch_up_rad=math.radians(self._scenario.vehicle.camera.pitch_up_deg),
                     mount_yaw_rad=math.radians(self._scenario.vehicle.camera.yaw_deg),
+                    start="hover" if aircraft.start == "hover" else "arm",
                     decided=decided,
                 )
                 used = use.end()

@@ -37,6 +37,7 @@ from airl_mav.rehearsal.channel import (
     Text,
     serve,
 )
+from airl_mav.rehearsal.episode_setup import episode_setup
 from airl_mav.rehearsal.true_state import state_of
 from airl_mav.scenario.aircraft import Aircraft
 from airl_mav.scenario.resolved import ResolvedScenario
@@ -52,7 +53,7 @@ from firmware_sim.mavlink.link import LinkConfig
 from firmware_sim.mavlink.udp_links import UdpLinks, bind_udp_links, udp_server
 from firmware_sim.pacing import Pacing, WallPacing
 from firmware_sim.plant.camera_server import CameraServer
-from firmware_sim.simulation import EpisodeSetup, Simulation
+from firmware_sim.simulation import Simulation
 from firmware_sim.warm_up import warm_up
 
 if TYPE_CHECKING:  # A firmware that nobody watches need not load it.
@@ -188,8 +189,7 @@ class Service:
     def _load(self, request: LoadEpisode) -> None:
         scenario = self._scenario
         arena = scenario.arena_of(request.seed)
-        computer_w = scenario.computer.onboard_watts
-        episode = EpisodeSetup(scenario.vehicle, arena, request.seed, scenario.scenario, computer_w)
+        episode = episode_setup(scenario, arena, request.seed)
         tlog = Path(request.tlog) if request.tlog else None
         self._crash = CrashDetector()
         self._due.clear()

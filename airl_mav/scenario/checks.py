@@ -17,6 +17,9 @@ SITL_SPEEDS = 0.5, 10.0
 """Speeds at which MAVSDK, which lives by the wall clock, still works: slower, it misses heartbeats
 (1 Hz of simulated time, 3 s allowed); faster, its 20 Hz of setpoints come near offboard loss."""
 
+NOT_IN_THE_AIR = ("ground", "climb", "landing")
+"""Phases of a flight, as faults name them, that a hover start leaves out."""
+
 REAL_FIRMWARE_NEEDS = {
     "px4": ("px4_dir", "px4_connect"),
     "ardupilot": ("ardupilot_dir", "ardupilot_connect"),
@@ -47,6 +50,19 @@ def check_level(scenario: Scenario) -> None:
         raise FieldError("tlogs", scenario.tlogs, "at level lockstep")
     if level == "sitl" and scenario.workers is not None:
         raise FieldError("workers", scenario.workers, "at level gym or lockstep")
+
+
+def check_start(scenario: Scenario) -> None:
+    """Raise FieldError for a hover start that the firmware, or a fault, cannot have."""
+    if scenario.start == "ground":
+        return
+    if scenario.firmware != "builtin":
+        raise FieldError("start", scenario.start, "ground with real firmware")
+    for fault in scenario.faults:
+        if fault.phase in NOT_IN_THE_AIR:
+            raise FieldError(
+                "faults", str(fault), f"start ground, as a hover start has no {fault.phase}"
+            )
 
 
 def check_drawing(renderer: Renderer, level: LevelName) -> None:

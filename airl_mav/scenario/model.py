@@ -47,6 +47,7 @@ GREATEST_ZONE = 100
 LevelName = Literal["gym", "lockstep", "sitl"]
 RuntimeName = Literal["onnx", "torch"]
 AblationName = Literal["depth", "rgb", "grey", "velocity", "goal"]
+StartName = Literal["ground", "hover"]
 
 
 def _seed(description: str, default: Any = 1) -> Any:
@@ -329,6 +330,12 @@ class Flights(Workers):
         ge=0,
         le=GREATEST_ZONE,
         default=None,
+    )
+    start: StartName = Field(
+        default="ground",
+        description="ground: the companion arms, takes off and lands; hover: the episode begins in"
+        " Hold at the altitude, above the start, and at level lockstep ends at the verdict. Level"
+        " gym always begins in a hover",
     )
     time_limit_s: TimeLimit = TIME_LIMIT_S
     speed: Annotated[float | None, FREE, NO_TWIN] = quantity(

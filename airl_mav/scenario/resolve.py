@@ -20,6 +20,7 @@ from airl_mav.scenario.checks import (
     check_level,
     check_plant,
     check_ports,
+    check_start,
 )
 from airl_mav.scenario.compile_plans import plan_of
 from airl_mav.scenario.model import Scenario
@@ -49,6 +50,7 @@ def resolve(scenario: Scenario, policy: PolicyInfo | None = None) -> ResolvedSce
     if scenario.level != "gym":
         check_plant(scenario)
     check_firmware(scenario, scenario.level, scenario.speed)
+    check_start(scenario)
     if scenario.level == "sitl":
         # The companion connects to the camera by its number: it cannot be "any free one" here.
         check_ports(scenario.open_ports, any_camera=False)

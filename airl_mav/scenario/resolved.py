@@ -38,6 +38,9 @@ from airl_mav.scenario.piloting import (
     load_asked_policy,
 )
 
+HOVER_START_S = 0.3
+"""From the begin of a flight in a hover to navigation: connection and switch to offboard [s]."""
+
 BEFORE_CLIMB_S = 9.2
 """What a take-off of the built-in autopilot takes besides its climb [s]: booting, arming, spinning
 up, slowing down. 150 of them to 2.5 m took 10.6 to 11.2 s, 10.88 s on average."""
@@ -157,6 +160,8 @@ class ResolvedScenario:
         """How long a take-off takes, nearly [s]; 0 at level gym, which has none."""
         if self.scenario.level == "gym":
             return 0.0
+        if self.scenario.start == "hover":
+            return HOVER_START_S
         parameters = flown_values(self.vehicle.autopilot_parameters())
         return BEFORE_CLIMB_S + self.pilot.altitude_m / parameters["MPC_TKO_SPEED"]
 

@@ -17,8 +17,7 @@ from airl_mav.scenario.model import LimitSettings, PilotSettings, Scenario, Watc
 from airl_mav.scenario.piloting import NATIVE_T2_US
 from airl_mav.scenario.resolve import resolve
 from airl_mav.scenario.resolved import ResolvedScenario
-from airl_mav.scenario.stand_alone import Start
-from companion.mission import MissionResult, fly_mission
+from companion.mission import MissionResult, Start, fly_mission
 from companion.pilot import Decided
 
 SEED = 11

@@ -1,0 +1,94 @@
+"""Hover start: an episode that begins in the air, above the start.
+
+The built-in autopilot flies its own take-off before the episode begins: without MAVLink, camera and
+record, as fast as plant and autopilot are computed. Estimator, commander, battery and wind then are
+those of a vehicle that has taken off; nothing of their state is made up.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+from airl_mav.core.constants import (
+    TAKEOFF_REACHED_M,
+    TAKEOFF_REACHED_M_S,
+    TICK_HZ,
+    US_PER_S,
+)
+from airl_mav.core.frames import Geodetic
+from firmware_sim.autopilot.autopilot_state import Mode, Result
+from firmware_sim.autopilot.commander import Phase
+
+if TYPE_CHECKING:
+    from firmware_sim.autopilot.autopilot import BuiltinAutopilot
+    from firmware_sim.simulation import Simulation
+
+GROUND_LIMIT_S = 30.0
+"""Maximum time for boot, arming, spin-up and the approach of the altitude [s]."""
+
+CLIMB_LIMIT_M_S = 0.5
+"""Minimum mean speed of the climb [m/s]; PX4's take-off climbs at 1.5 m/s."""
+
+LOOK_TICKS = TICK_HZ // 10
+"""Ticks between two looks at the vehicle's state."""
+
+ARM_RETRY_US = US_PER_S
+"""Time between two requests to arm, while pre-arm checks fail [µs]."""
+
+NEVER_US = 1 << 61
+"""Begin of an episode for its faults, while the vehicle takes off [µs]."""
+
+
+class HoverStart(NamedTuple):
+    """Height and origin of a hover start."""
+
+    altitude_m: float
+    """Height above the start [m]."""
+    origin: Geodetic | None = None
+    """Place of the start, for a vehicle without GPS; None = GPS measures it."""
+
+    def fly(self, simulation: Simulation) -> bool:
+        """Fly the take-off, up to Hold at the altitude; then call `Simulation.begin`.
+
+        Moving obstacles stand still and faults are inactive until then. The autopilot must be the
+        built-in one, at rest on the ground.
+
+        Returns:
+            Whether the altitude was reached. If not, the vehicle is where the attempt ended, and
+            clients receive the texts that explain why.
+        """
+        autopilot = simulation.autopilot.internals
+        assert autopilot is not None  # noqa: S101 (`airl_mav.scenario.checks` refuses others)
+        if self.origin is not None:
+            autopilot.set_origin(self.origin)
+        recorder, simulation.recorder = simulation.recorder, None
+        on_message, autopilot.on_message = autopilot.on_message, None
+        if simulation.faults is not None:
+            simulation.faults.begin(NEVER_US)
+        limit_s = GROUND_LIMIT_S + self.altitude_m / CLIMB_LIMIT_M_S
+        reached = self._climb(simulation, autopilot, simulation.time_us + round(limit_s * US_PER_S))
+        simulation.recorder, autopilot.on_message = recorder, on_message
+        if reached:
+            autopilot.take_messages()
+            autopilot.take_events()
+        return reached
+
+    def _climb(self, simulation: Simulation, autopilot: BuiltinAutopilot, until_us: int) -> bool:
+        """Arm and climb; return whether the altitude is reached before `until_us` [µs]."""
+        start_m, arm_us = 0.0, simulation.time_us
+        while simulation.time_us < until_us:
+            for _ in range(LOOK_TICKS):
+                simulation.plant.begin()  # Moving obstacles stay where their tours begin.
+                simulation.tick()
+            flight, estimate = autopilot.flight, autopilot.estimator.estimate()
+            down_m, down_m_s = estimate.position.item(2), estimate.velocity.item(2)
+            if flight.phase is Phase.STANDBY and simulation.time_us >= arm_us:
+                start_m, arm_us = down_m, simulation.time_us + ARM_RETRY_US
+                if autopilot.arm(force=False) is Result.ACCEPTED:
+                    autopilot.takeoff(self.altitude_m)
+            elif flight.phase is Phase.AIR and flight.mode is Mode.HOLD:
+                height_m = start_m - down_m
+                climbs = height_m < self.altitude_m - TAKEOFF_REACHED_M
+                if not climbs and abs(down_m_s) < TAKEOFF_REACHED_M_S:
+                    return True
+        return False
