@@ -33,6 +33,7 @@ from firmware_sim.plant.kinematics import POSITION, QUATERNION, RATES, VELOCITY
 from firmware_sim.plant.onboard_camera import CameraMaker, OnboardCamera
 from firmware_sim.plant.plant import Plant
 from firmware_sim.recording import FlightRecorder, fault_arrays
+from firmware_sim.simulation_snapshot import SimulationSnapshot
 
 
 @dataclass(frozen=True)
@@ -197,6 +198,14 @@ class Simulation:
             return {}
         acted = [] if self.faults is None else self.faults.acted(self.time_us)
         return self.recorder.arrays() | fault_arrays(acted)
+
+    def snapshot(self) -> SimulationSnapshot:
+        """Return the present state; `restore` makes simulations of it that fly on bit-identically.
+
+        Raises ValueError for real firmware, and for a simulation whose flight is logged or linked.
+        """
+        setup = self._setup
+        return SimulationSnapshot(self, setup, setup.vehicle, setup.arena, self._clock)
 
     def close(self) -> None:
         """Release the physics server and the autopilot."""

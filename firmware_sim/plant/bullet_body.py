@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -21,7 +22,7 @@ from airl_mav.vehicle.rotation import Quat, Vec
 from firmware_sim.plant.body import NOTHING, Touch
 from firmware_sim.plant.bullet import pybullet
 from firmware_sim.plant.kinematics import WIDTH, from_bullet
-from firmware_sim.plant.world import World
+from firmware_sim.plant.world import World, WorldState
 
 _ANY_LINK = -2
 """pybullet's filter of contacts that lets all links pass."""
@@ -44,6 +45,7 @@ class BulletBody:
             airframe: Its mass and inertia.
             tick_s: Length of a tick [s].
         """
+        self._made_of = arena, body, airframe, tick_s
         diagonal_m = math.hypot(body.width_m, body.width_m, body.height_m)
         self.world = World(arena, 0.5 * diagonal_m, tick_s)
         self._tick_s = tick_s
@@ -59,6 +61,15 @@ class BulletBody:
     def close(self) -> None:
         """Release the physics server."""
         self.world.close()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle it as a new world of the same bodies, and pybullet's state of that."""
+        return BulletBody, self._made_of, (self.world.state(), self.touch)
+
+    def __setstate__(self, state: tuple[WorldState, Touch]) -> None:
+        """Take over the state of the body that was pickled."""
+        world, self.touch = state
+        self.world.restore(world)
 
     def move(self, at: Vec, force: Vec, torque: Vec, before: Vector, moving_us: int) -> Vector:
         """Move on by one tick; as `Body`."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,7 +19,7 @@ from airl_mav.core.frames import (
     quat_wxyz_to_xyzw,
 )
 from firmware_sim.plant.body import FLOOR, walls_of
-from firmware_sim.plant.bullet import NO_CLIENT, connect, number_of, pybullet
+from firmware_sim.plant.bullet import NO_CLIENT, connect, number_of, pybullet, silenced_output
 from firmware_sim.plant.movers import Movers, Xyzw
 
 
@@ -30,6 +32,15 @@ LEVEL = facing(0.0)
 
 UNTURNED: Xyzw = (0.0, 0.0, 0.0, 1.0)
 """That of a body whose shape is given in ENU."""
+
+
+class WorldState(NamedTuple):
+    """State of a pybullet world."""
+
+    bullet: bytes
+    """File of pybullet's `saveBullet`."""
+    movers: Movers | None
+    """Moving obstacles; None = the arena has none."""
 
 
 class World:
@@ -61,6 +72,23 @@ class World:
             if arena.tours:
                 first = arena.n_static
                 self._movers = Movers(arena, bodies[first:], attitudes[first:], vehicle_radius_m)
+
+    def state(self) -> WorldState:
+        """Return the state, contacts included."""
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / "world.bullet"
+            with silenced_output():
+                self.client.saveBullet(str(path))
+            return WorldState(path.read_bytes(), self._movers)
+
+    def restore(self, state: WorldState) -> None:
+        """Take over the state of another world of the same bodies."""
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / "world.bullet"
+            path.write_bytes(state.bullet)
+            with silenced_output():
+                self.client.restoreState(fileName=str(path))
+        self._movers = state.movers
 
     def close(self) -> None:
         """Release the physics server."""
