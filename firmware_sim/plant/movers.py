@@ -88,7 +88,7 @@ class Movers:
         is_box = obstacles.shape[first:] == Shape.BOX
         bounding = np.where(is_box, np.hypot(half[:, 0], half[:, 1]), half[:, 0])
         self._reach = bounding + radius_m + MARGIN_M
-        self._place = np.ascontiguousarray(obstacles.center[first:, :2])
+        self._place = np.array(obstacles.center[first:, :2], order="C")
         self._up: list[float] = (-obstacles.center[first:, 2]).tolist()
         self._leg = np.zeros(n, np.int64)
         self._due = np.zeros(n, np.int64)
