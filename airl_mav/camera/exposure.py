@@ -34,6 +34,7 @@ class Exposure(Protocol):
         max_range: float,
         position: Vec | NDArray[np.float64],
         quaternion: Quat | NDArray[np.float64],
+        number: int = 0,
     ) -> NDArray[Any]:
         """Return the image."""
         ...
@@ -41,19 +42,19 @@ class Exposure(Protocol):
 
 def exposure_by(renderer: Renderer, name: str = "") -> Exposure:
     """Return what takes the images of a camera with this renderer; "" is the main camera."""
-    return expose if renderer == "raycast" else PathTraced(sum(words_of(name)))
+    return expose if renderer == "raycast" else PathTraced(1 + sum(words_of(name)))
 
 
 class PathTraced:
-    """Takes colour images by Mitsuba's path tracer, each with noise of its own."""
+    """Takes colour images by Mitsuba's path tracer, each number with noise of its own."""
 
     def __init__(self, first: int = 0) -> None:
-        """Take the seed of the first image's noise; the next ones follow, modulo 2^32."""
+        """Take the seed of image 0's noise; those of the next numbers follow, modulo 2^32."""
         # Imported here: what it draws with is an extra.
         from airl_mav.camera.mitsuba import PathTracer
 
         self._tracer = PathTracer(PATHS)
-        self._seed = first
+        self._first = first
 
     def __call__(
         self,
@@ -63,11 +64,12 @@ class PathTraced:
         max_range: float,  # noqa: ARG002 (colour has no limit)
         position: Vec | NDArray[np.float64],
         quaternion: Quat | NDArray[np.float64],
+        number: int = 0,
     ) -> NDArray[Any]:
         """Return the image; see `expose`. Raises as `mitsuba.path_traced`."""
         pose = np.asarray(position), np.asarray(quaternion)
-        rgb = self._tracer(arena, centers, intrinsics, *pose, seed=self._seed)
-        self._seed = (self._seed + 1) % _SEEDS
+        seed = (self._first + number) % _SEEDS
+        rgb = self._tracer(arena, centers, intrinsics, *pose, seed=seed)
         return rgb if intrinsics.kind == "rgb" else grey(rgb)[..., None]
 
 
@@ -78,10 +80,11 @@ def expose(
     max_range: float,
     position: Vec | NDArray[np.float64],
     quaternion: Quat | NDArray[np.float64],
+    number: int = 0,  # noqa: ARG001 (nothing is drawn by lot)
 ) -> NDArray[Any]:
     """Return the image that a camera takes of an arena, as in `Frame.image`; see `render.render`.
 
-    Colour has no maximum depth.
+    Colour has no maximum depth. `number`: the image's in the episode, for renderers with noise.
     """
     if intrinsics.kind == "depth":
         return depth_to_z16(render(arena, centers, intrinsics, max_range, position, quaternion))

@@ -61,6 +61,12 @@ class ImageFormation:
         self._through = image_sensor.vignette(self._camera, share)[..., None] if share else None
         self.restart()
 
+    @property
+    def follows(self) -> bool:
+        """Whether an image depends on the one before: the gain takes time to change."""
+        auto = self._imaging.auto_exposure
+        return auto is not None and auto.time_constant_s > 0.0
+
     def restart(self) -> None:
         """Begin an episode: the gain is that of the first image at once."""
         self.gain: float | None = None

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import replace
+from typing import Any
+
+from numpy.typing import NDArray
 
 from airl_mav.camera.frame import Frame
 from airl_mav.camera.noise import DepthNoise, noisy_frame
@@ -59,11 +61,11 @@ class FailingCamera:
                 noise = DepthNoise(None, SensorNoise(depth_noise=each.fault.amount))
                 seed = NOISE_SEED * (each.number + 1) + self._seed
                 depth = noisy_frame(frame.depth_mm, noise, seed, frame.sequence)
-                frame = replace(frame, image=depth)
+                frame = _showing(frame, depth, frame.jpeg)
             else:  # stuck
                 if self._frozen is None:
                     self._frozen = frame
-                frame = replace(frame, image=self._frozen.image, jpeg=self._frozen.jpeg)
+                frame = _showing(frame, self._frozen.image, self._frozen.jpeg)
         if delay_us or self._late:
             # A frame that was taken later must not overtake: a camera's frames come in order.
             due_us = frame.capture_time_us + delay_us
@@ -75,3 +77,9 @@ class FailingCamera:
         self._acting = self._timeline.acting("camera")
         if all(each.fault.kind != "stuck" for each in self._acting):
             self._frozen = None
+
+
+def _showing(frame: Frame, image: NDArray[Any], jpeg: bytes | None) -> Frame:
+    """Return a frame with another image of the main camera."""
+    shown = image, frame.intrinsics, jpeg, frame.further
+    return Frame(frame.sequence, frame.capture_time_us, *shown)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -38,6 +39,8 @@ class _Eye:
         self.intrinsics = Intrinsics.of(camera)
         self._mount, self._max_range = Mount.of(camera), camera.range_m
         self._arena = arena
+        self.follows = self._forming is not None and self._forming.follows
+        """Whether an image depends on the one before."""
 
     def restart(self) -> None:
         """Begin an episode."""
@@ -61,11 +64,52 @@ class _Eye:
             at, attitude = camera_pose(motion.position, motion.quaternion, self._mount)
             centers = self._arena.centers_at(elapsed_us)
             image = self._expose(
-                self._arena, centers, self.intrinsics, self._max_range, at, attitude
+                *(self._arena, centers, self.intrinsics, self._max_range, at, attitude), number
             )
         if self._noise is not None:
             image = noisy_frame(image, self._noise, seed, number)
         return FurtherImage(image, self.intrinsics, jpeg)
+
+
+class ExposedFrame(Frame):
+    """A frame whose images are drawn when one of them is first read: few of them are."""
+
+    def __init__(
+        self,
+        sequence: int,
+        capture_time_us: int,
+        intrinsics: Intrinsics,
+        draw: Callable[[], Mapping[str, FurtherImage]],
+    ) -> None:
+        """Take what a frame has, and what draws the images: by camera, "" is the main one."""
+        exposed = {"sequence": sequence, "capture_time_us": capture_time_us}
+        vars(self).update(exposed, intrinsics=intrinsics, draw=draw)
+
+    @cached_property
+    def images(self) -> Mapping[str, FurtherImage]:
+        """All images, by camera."""
+        draw: Callable[[], Mapping[str, FurtherImage]] = vars(self)["draw"]
+        return draw()
+
+    @property
+    def image(self) -> NDArray[Any]:
+        """The main camera's image."""
+        return self.images[""].image
+
+    @property
+    def jpeg(self) -> bytes | None:
+        """The file that it was decoded from; None: it was never compressed."""
+        return self.images[""].jpeg
+
+    @cached_property
+    def further(self) -> Mapping[str, FurtherImage]:
+        """Those of the further cameras, by name."""
+        return {name: each for name, each in self.images.items() if name}
+
+    def __reduce__(self) -> tuple[type[Frame], tuple[Any, ...]]:
+        """Return a frame with its images: another process has no camera to draw them."""
+        shown = self.image, self.intrinsics, self.jpeg, self.further
+        return Frame, (self.sequence, self.capture_time_us, *shown)
 
 
 class SimulatedCamera:
@@ -93,22 +137,20 @@ class SimulatedCamera:
             further: Those that are triggered with it, by name; None: there are none.
         """
         asked = noise or SensorNoise()
-        self._main = _Eye(camera, arena, asked, renderer)
-        self._further = {
-            name: _Eye(each, arena, asked, renderer, name) for name, each in (further or {}).items()
+        cameras = {"": camera, **(further or {})}
+        self._eyes = {
+            name: _Eye(each, arena, asked, renderer, name) for name, each in cameras.items()
         }
+        self._intrinsics = self._eyes[""].intrinsics
+        self._in_order = any(each.follows for each in self._eyes.values())
         self._seed = seed
         self._rate_hz = camera.rate_hz
         self._sequence = 0
         # The first picture loads or compiles the kernels: better here than in flight.
         at_rest = Motion.at_rest(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
-        for each in self._eyes:
+        for each in self._eyes.values():
             each.take(0, at_rest, seed, 0)
         self.restart(start_us)
-
-    @property
-    def _eyes(self) -> tuple[_Eye, ...]:
-        return (self._main, *self._further.values())
 
     def restart(self, time_us: int) -> None:
         """Begin an episode, and with it its moving obstacles: the next frame is due at `time_us`.
@@ -118,7 +160,7 @@ class SimulatedCamera:
         self._start_us = self.next_us = time_us
         """`next_us`: simulated time from which on the next frame is due [µs]."""
         self._rate = Rate(self._rate_hz)
-        for each in self._eyes:
+        for each in self._eyes.values():
             each.restart()
 
     def offer(self, time_us: int, motion: Motion, publish: Callable[[Frame], None]) -> None:
@@ -136,15 +178,21 @@ class SimulatedCamera:
         is kept on average. Slots that were missed are left out.
 
         It is exposed at simulated `time_us` [µs], which is the middle of an exposure that takes
-        time, from where the vehicle is then.
+        time, from where the vehicle is then. The images are drawn when they are read, unless one
+        of them depends on the one before.
         """
         elapsed_us = time_us - self._start_us
         self._rate.due(elapsed_us)
         self.next_us = self._start_us + math.ceil(self._rate.next_us)
-        seen, period = (elapsed_us, motion, self._seed), self._rate.period
-        main = self._main.take(*seen, period)
-        further = {name: each.take(*seen, period) for name, each in self._further.items()}
-        frame = Frame(*(self._sequence, time_us, main.image, main.intrinsics, main.jpeg), further)
+        # The vehicle flies on in the same arrays.
+        seen = elapsed_us, Motion(*map(np.array, motion)), self._seed, self._rate.period
+
+        def draw() -> Mapping[str, FurtherImage]:
+            return {name: each.take(*seen) for name, each in self._eyes.items()}
+
+        frame = ExposedFrame(self._sequence, time_us, self._intrinsics, draw)
+        if self._in_order:
+            _ = frame.images
         self._sequence += 1
         return frame
 
