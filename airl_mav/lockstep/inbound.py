@@ -14,7 +14,16 @@ from typing import TypeAlias
 
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from firmware_sim.autopilot.mode_numbers import MAIN_OFFBOARD
-from firmware_sim.mavlink.codec import Decoder, Encoder, WireMessage, dialect
+from firmware_sim.mavlink.codec import (
+    Decoder,
+    Encoder,
+    Layout,
+    WireMessage,
+    dialect,
+    layout,
+    payload,
+    trimmed,
+)
 
 REPEAT_US = US_PER_S // 20
 """MAVSDK repeats the newest setpoint so often [µs] (its offboard plugin: 20 Hz)."""
@@ -30,6 +39,14 @@ _BY_THE_WALL_CLOCK = (
     dialect.MAVLINK_MSG_ID_TIMESYNC,
     dialect.MAVLINK_MSG_ID_SYSTEM_TIME,
 )
+_MAVLINK_2 = b"\xfd"
+"""How a MAVLink 2 frame begins."""
+_MESSAGE = slice(7, 10)
+"""Where a MAVLink 2 frame has the number of its message."""
+_IGNORED = frozenset(number.to_bytes(3, "little") for number in _BY_THE_WALL_CLOCK)
+"""The same numbers as a frame has them: most of what MAVSDK sends need not be decoded."""
+_TIME_BYTES = 4
+"""Length of the time stamp with which the payload of a setpoint begins."""
 _ASKED_BY_THE_WALL_CLOCK = {
     (dialect.MAV_CMD_REQUEST_MESSAGE, dialect.MAVLINK_MSG_ID_HOME_POSITION): (
         dialect.MAV_RESULT_DENIED
@@ -77,9 +94,8 @@ class Inbound:
     def __init__(self) -> None:
         self.next_repeat_us: int | None = None
         """When the newest setpoint is due again [µs]; None: nothing is repeated."""
-        self._setpoint: WireMessage | None = None
-        self._body = b""
-        """The newest setpoint without its time stamp."""
+        self._setpoint: tuple[tuple[int, int], Layout, bytes] | None = None
+        """The newest setpoint: its sender, and its payload behind the time stamp."""
         self._counted = 0
         """Setpoints of the companion that have been delivered."""
         self._decoder = Decoder(datagrams=True)
@@ -96,6 +112,8 @@ class Inbound:
             frame: A MAVLink frame of the companion.
             now_us: Simulated time [µs].
         """
+        if frame[:1] == _MAVLINK_2 and frame[_MESSAGE] in _IGNORED:
+            return NOTHING
         messages = self._decoder.feed(frame)
         if len(messages) != 1:
             return NOTHING
@@ -132,11 +150,12 @@ class Inbound:
         self.next_repeat_us = None
 
     def _take_setpoint(self, message: WireMessage, now_us: int) -> Passed:
-        message.time_boot_ms = 0
-        body = bytes(message.pack(dialect.MAVLink(None)))
-        if body == self._body:
+        sender = message.get_srcSystem(), message.get_srcComponent()
+        values = payload(message)[_TIME_BYTES:].rstrip(b"\0")
+        setpoint = sender, layout(message.get_type()), values
+        if setpoint == self._setpoint:
             return NOTHING
-        self._body, self._setpoint = body, message
+        self._setpoint = setpoint
         self._counted += 1
         return Passed((self.repeat(now_us),))
 
@@ -160,24 +179,28 @@ class Inbound:
         """Return the newest setpoint as MAVSDK repeats it; call when `next_repeat_us` is due."""
         assert self._setpoint is not None  # noqa: S101 (there is one whenever it is due)
         self.next_repeat_us = now_us + REPEAT_US
-        self._setpoint.time_boot_ms = now_us // US_PER_MS
-        return self._pack(self._setpoint)
+        sender, kind, values = self._setpoint
+        stamp = (now_us // US_PER_MS).to_bytes(_TIME_BYTES, "little")
+        return _encoder(self._numbered, sender).frame(kind, trimmed(stamp + values))
 
     def _pack(self, message: WireMessage, encoders: Encoders | None = None) -> bytes:
         encoders = self._numbered if encoders is None else encoders
         sender = message.get_srcSystem(), message.get_srcComponent()
-        if sender not in encoders:
-            encoders[sender] = Encoder(*sender)
-        return encoders[sender].pack(message)
+        return _encoder(encoders, sender).pack(message)
 
     def _answer(self, command: WireMessage, result: int) -> bytes:
         sender = command.get_srcSystem(), command.get_srcComponent()
         vehicle = command.target_system, dialect.MAV_COMP_ID_AUTOPILOT1
-        if vehicle not in self._own:
-            self._own[vehicle] = Encoder(*vehicle)
-        return self._own[vehicle].pack(
+        return _encoder(self._own, vehicle).pack(
             dialect.MAVLink_command_ack_message(command.command, result, 0, 0, *sender)
         )
+
+
+def _encoder(encoders: Encoders, sender: tuple[int, int]) -> Encoder:
+    """Return a sender's encoder, made when it is first needed."""
+    if sender not in encoders:
+        encoders[sender] = Encoder(*sender)
+    return encoders[sender]
 
 
 def _enters_offboard(command: WireMessage) -> bool:
