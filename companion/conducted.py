@@ -3,15 +3,35 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
-from typing import TypeAlias
+from typing import NamedTuple, Protocol
 
 from airl_mav.core.clock import Clock
+from companion.interfaces import Due
 from companion.watchdog import Watchdog
 
-Sleep: TypeAlias = "Callable[[int, threading.Event | None], None]"
-"""Gives the turn back until a simulated time [µs], or until the event is set; returns with the next
-turn, which may come earlier."""
+
+class Poll(NamedTuple):
+    """A condition that is checked at an interval."""
+
+    every_us: int
+    due: Due
+
+
+class Sleep(Protocol):
+    """Gives the turn back."""
+
+    def __call__(
+        self, wake_us: int, interrupt: threading.Event | None = None, poll: Poll | None = None
+    ) -> None:
+        """Return with the next turn, which may come earlier than asked for.
+
+        Args:
+            wake_us: Simulated time of the next turn [µs].
+            interrupt: Ends the sleep when it is set.
+            poll: Postpones `wake_us` by its interval while it is not due. A scheduler may ignore
+                it.
+        """
+        ...
 
 
 class Abandoned(BaseException):
@@ -44,6 +64,14 @@ class ConductedClock:
                 self._sleep(wake_us, interrupt)
             if watchdog is not None and due_us is not None and self.time_us() >= due_us:
                 watchdog.look()
+
+    def poll(self, every_us: int, due: Due) -> None:
+        """Sleep for one interval [µs] or several, until a condition has to be checked."""
+        wake_us = self.time_us() + every_us
+        if self._watchdog is None:
+            self._sleep(wake_us, None, Poll(every_us, due))
+        else:
+            self.sleep_until(wake_us)
 
     def start(self, watchdog: Watchdog) -> None:
         """Check a watchdog's deadlines from now on."""

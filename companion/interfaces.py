@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol, TypeAlias
 
 from airl_mav.policy.actions import Attitude, BodyRates
@@ -55,6 +56,10 @@ class BodyVelocity(NamedTuple):
 
 
 STOP = BodyVelocity(0.0, 0.0, 0.0, 0.0)
+
+Due: TypeAlias = "Callable[[Sequence[bytes]], bool]"
+"""Returns whether a condition has to be checked, given the MAVLink frames of the flight controller
+that MAVSDK has not received yet."""
 
 Setpoint: TypeAlias = "BodyVelocity | Attitude | BodyRates"
 """What is sent: four numbers each."""

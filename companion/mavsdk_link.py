@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import json
 import math
+import struct
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -61,6 +62,18 @@ STREAM_TIMEOUT_S = 10.0
 STREAM_RETRY_S = 0.2
 """Time between two requests for a stream [wall s]."""
 
+_HEADER = 10
+"""Length of a MAVLink 2 header [bytes]."""
+
+_HEARTBEAT, _LOCAL_POSITION_NED = b"\x00\x00\x00", b"\x20\x00\x00"
+"""Message numbers as a frame has them."""
+
+_BASE_MODE, _ARMED = 6, 0x80
+"""Offset of a HEARTBEAT's base mode, and its bit for armed."""
+
+_DOWN = struct.Struct("<12xf12x")
+"""Payload of LOCAL_POSITION_NED; its z [m]."""
+
 
 class MavsdkLink:
     """MAVSDK over UDP, serial or raw bytes. Implements `Link`."""
@@ -71,6 +84,7 @@ class MavsdkLink:
         clock: Clock,
         abandon: threading.Event | None = None,
         heard: Callable[[], bool] | None = None,
+        poll: Callable[[int, interfaces.Due], None] | None = None,
     ) -> None:
         """Open a connection, as `open_connection`; `connect` waits for the vehicle.
 
@@ -80,9 +94,12 @@ class MavsdkLink:
             abandon: Set from another thread to end any wait.
             heard: Whether the flight controller is received, independent of wall time; None =
                 MAVSDK decides.
+            poll: Sleeps for an interval [µs], and again while a condition need not be checked;
+                None = it is checked after every interval.
         """
         self.url = url
         self._clock = clock
+        self._poll = poll
         self._abandon = abandon or threading.Event()
         self._heard = heard
         self.setpoints_sent = 0
@@ -305,14 +322,19 @@ class MavsdkLink:
         start_down = float(self.kinematics().position[2])
         self._call("take-off", lambda: self._action.set_takeoff_altitude(altitude_m))
         self._call("take-off", self._action.takeoff)
-        deadline_us = self._deadline(timeout_s)
+        deadline_us, least_m = self._deadline(timeout_s), altitude_m - TAKEOFF_REACHED_M
+
+        def high(frames: Sequence[bytes]) -> bool:
+            position = _newest(frames, _LOCAL_POSITION_NED)
+            return position is not None and start_down - _down(position) > least_m
+
         while True:
             state = self.kinematics()
             height, speed = start_down - float(state.position[2]), abs(float(state.velocity[2]))
-            if height > altitude_m - TAKEOFF_REACHED_M and speed < TAKEOFF_REACHED_M_S:
+            if height > least_m and speed < TAKEOFF_REACHED_M_S:
                 return
             self._check(deadline_us, f"take-off: {height:.1f} m after {timeout_s:g} s", stop)
-            self._pause()
+            self._pause_until(high, deadline_us, stop)
 
     def enter_offboard(self) -> None:
         """Send a zero setpoint and switch to offboard; return when setpoints take effect."""
@@ -404,7 +426,7 @@ class MavsdkLink:
         deadline_us = self._deadline(timeout_s)
         while self.armed:
             self._check(deadline_us, f"landing: still armed after {timeout_s:g} s")
-            self._pause()
+            self._pause_until(_disarmed, deadline_us)
 
     def _call(self, what: str, call: Any) -> None:
         try:
@@ -418,17 +440,58 @@ class MavsdkLink:
     def _check(
         self, deadline_us: int | None, message: str = "", stop: threading.Event | None = None
     ) -> None:
+        if (why := self._over(deadline_us, message, stop)) is not None:
+            raise interfaces.LinkError(why)
+
+    def _over(
+        self, deadline_us: int | None, message: str = "", stop: threading.Event | None = None
+    ) -> str | None:
+        """Return why nothing may be waited for any more, None if it may."""
         if not self.connected:
-            raise interfaces.LinkError("the flight controller is no longer heard")
+            return "the flight controller is no longer heard"
         if self._abandon.is_set():
-            raise interfaces.LinkError("abandoned")
+            return "abandoned"
         if stop is not None and stop.is_set():
-            raise interfaces.LinkError("stopped")
+            return "stopped"
         if deadline_us is not None and self._clock.time_us() >= deadline_us:
-            raise interfaces.LinkError(message)
+            return message
+        return None
 
     def _pause(self, seconds: float = POLL_S) -> None:
         self._clock.sleep_until(self._clock.time_us() + int(seconds * US_PER_S))
+
+    def _pause_until(
+        self, due: interfaces.Due, deadline_us: int, stop: threading.Event | None = None
+    ) -> None:
+        """Wait for one `POLL_S`, or for several if `due` tells that a condition still fails."""
+        if self._poll is None:
+            self._pause()
+        else:
+            self._poll(
+                int(POLL_S * US_PER_S),
+                lambda frames: due(frames) or self._over(deadline_us, stop=stop) is not None,
+            )
+
+
+def _newest(frames: Sequence[bytes], number: bytes) -> bytes | None:
+    """Return the last frame of a message, None if there is none."""
+    for frame in reversed(frames):
+        if frame[7:10] == number:
+            return frame
+    return None
+
+
+def _disarmed(frames: Sequence[bytes]) -> bool:
+    heartbeat = _newest(frames, _HEARTBEAT)
+    return heartbeat is not None and not heartbeat[_HEADER + _BASE_MODE] & _ARMED
+
+
+def _down(position: bytes) -> float:
+    """Return z of a LOCAL_POSITION_NED [m]."""
+    # MAVLink 2 leaves out the zeros at the end of a payload.
+    payload = position[_HEADER : _HEADER + position[1]].ljust(_DOWN.size, b"\0")
+    (down,) = _DOWN.unpack(payload)
+    return float(down)
 
 
 def _known(value: float) -> float | None:

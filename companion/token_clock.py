@@ -17,7 +17,7 @@ from typing import Protocol
 from airl_mav.core.clock import Clock, SimClock
 from airl_mav.core.constants import US_PER_S
 from companion.camera import FrameSource, ReceivedFrame
-from companion.conducted import Abandoned
+from companion.conducted import Abandoned, Poll
 from companion.tokens import NO_FRAME, Event, Phase, TurnBack, TurnGiven
 
 FAREWELL_S = 3
@@ -72,13 +72,16 @@ class TokenTurns:
             raise
         self._end()
 
-    def sleep(self, wake_us: int, interrupt: threading.Event | None) -> None:
+    def sleep(
+        self, wake_us: int, interrupt: threading.Event | None = None, poll: Poll | None = None
+    ) -> None:
         """Return the turn until simulated `wake_us` [µs]; see `conducted.Sleep`.
 
         Raises:
             Abandoned: No turn comes any more.
             ValueError: The event is neither `stop` nor `frame_arrived`.
         """
+        del poll
         sent = 0 if self._link is None else self._link.setpoints_sent
         self._give_back(TurnBack(self._number, wake_us, sent, self._name_of(interrupt)))
         self._await_turn()

@@ -25,8 +25,12 @@ class UnderWay:
 
     def send(self, frame: Frame) -> None:
         """Send a frame on its way."""
-        self._frames.append(frame)
-        self.published.set()
+        frames, arrived_us = self._frames, frame.capture_time_us - self._transport_us
+        while len(frames) > 1 and frames[1].capture_time_us <= arrived_us:
+            frames.popleft()  # A newer one has arrived: nobody can see it any more.
+        frames.append(frame)
+        if not self.published.is_set():
+            self.published.set()
 
     def arrived(self, now_us: int) -> Frame | None:
         """Take out what has arrived by `now_us` [µs]; return the newest, None if nothing has."""
@@ -55,11 +59,8 @@ class MemoryCamera:
         self.clock: Clock | None = None
         """The companion's."""
         self._under_way = UnderWay(transport_us)
+        self.publish = self._under_way.send
         self._newest: ReceivedFrame | None = None
-
-    def publish(self, frame: Frame) -> None:
-        """Send a frame on its way."""
-        self._under_way.send(frame)
 
     def close(self) -> None:
         """Forget all frames."""

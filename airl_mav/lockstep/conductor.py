@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 from airl_mav.core.clock import SimClock, WallClock
 from airl_mav.core.constants import US_PER_S
@@ -18,8 +19,9 @@ from airl_mav.lockstep.turns import Partner, Turn
 from airl_mav.lockstep.vehicle_end import VehicleEnd, acknowledged, command_of
 from firmware_sim.flight_controller import FirmwareLostError
 
-FEED_FRAMES = 256
-"""So many frames of telemetry are passed on at a time, or all of them when a turn begins."""
+FEED_US = US_PER_S
+"""Telemetry is passed on when a turn begins, and after so long without one: MAVSDK gives a vehicle
+up after 3 s of wall time without a heartbeat [µs]."""
 
 SILENCE_US = 3 * US_PER_S
 """A flight controller that says nothing for longer is no longer heard, as MAVSDK has it [µs]."""
@@ -62,7 +64,7 @@ class Conductor:
         self._turn = Turn(None)
         self._waiting: list[bytes] = []
         """Telemetry that has not been passed on."""
-        self._heard_us = 0
+        self._heard_us = self._passed_us = 0
         self._asked: int | None = None
         """The command whose answer the companion waits for."""
         self._answered = threading.Event()
@@ -81,6 +83,7 @@ class Conductor:
         """Resume it: it has at once the turn that is overdue, and all telemetry since."""
         if self._suspended:
             self._suspended = False
+            self._turn = replace(self._turn, poll=None)
             self._inbound.resume(self.clock.time_us())
 
     @property
@@ -124,7 +127,13 @@ class Conductor:
                 break
             self.clock.sleep_until(first_us)
             if first_us == wake_us:
-                self._give_turn(readable)
+                self._vehicle.settle()
+                self._keep(self._vehicle.take())
+                poll = self._turn.poll
+                if poll is None or poll.due(self._waiting):
+                    self._give_turn(readable)
+                else:
+                    self._turn = replace(self._turn, wake_us=first_us + poll.every_us)
             else:
                 self._deliver(self._inbound.repeat(first_us), readable)
         self.clock.sleep_until(tick_us)
@@ -142,7 +151,7 @@ class Conductor:
         def handle(frame: bytes) -> threading.Event | None:
             passed = self._inbound.take(frame, now_us)
             if passed.answer is not None:
-                self._partner.send(passed.answer)
+                self._partner.send([passed.answer])
             waits = False
             for wanted in passed.deliver:
                 waits = self._deliver(wanted, readable, of_the_flight=passed.of_the_flight) or waits
@@ -152,8 +161,6 @@ class Conductor:
             raise FirmwareLostError(
                 f"the flight controller did not answer command {self._asked} of the companion"
             )
-        self._vehicle.settle()
-        self._keep(self._vehicle.take())
         self._pass_telemetry()
         self._turn = self._partner.turn(now_us, handle)
         if self._turn.wake_us is None:
@@ -195,16 +202,20 @@ class Conductor:
         self._heard_us = self.clock.time_us()
         self._digest.add("telemetry", self._heard_us, b"".join(frames))
         self._waiting += frames
-        if len(self._waiting) >= FEED_FRAMES or self._asked is not None:
+        if self._asked is not None or self._heard_us - self._passed_us >= FEED_US:
             self._pass_telemetry()
 
     def _pass_telemetry(self) -> None:
+        self._passed_us = self.clock.time_us()
+        poll = self._turn.poll
+        if poll is not None and poll.due(self._waiting):
+            self._turn = replace(self._turn, poll=None)
         if self._waiting:
             self._pass(self._waiting)
             self._waiting.clear()
 
     def _pass(self, frames: Sequence[bytes]) -> None:
-        self._partner.send(b"".join(frames))
+        self._partner.send(frames)
         if self._asked is not None and self._asked in map(acknowledged, frames):
             self._asked = None
             self._answered.set()

@@ -2,10 +2,46 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
+
+from firmware_sim.mavlink.codec import layout
+from firmware_sim.mavlink.rates import ONBOARD_HZ
 
 _OVERHEAD = 12
 """Header and checksum of a frame that is not signed [bytes]."""
+
+_MESSAGE = slice(7, 10)
+"""Where a frame has the number of its message."""
+
+_SENT_BY = slice(5, 10)
+"""Where it has that, and before it who sent it."""
+
+_PER_INSTANCE = ("DISTANCE_SENSOR",)
+"""Streams of several devices, told apart by a field."""
+
+STATES = frozenset(
+    layout(name).id_bytes
+    for name, rate_hz in ONBOARD_HZ.items()
+    if rate_hz > 1.0 and name not in _PER_INSTANCE
+)
+"""Messages of which only the newest counts: streams of a state, each a replacement of the one
+before, and TIMESYNC, whose answer the vehicle is not sent (`inbound`). Answers, events, texts and
+slow streams, as HEARTBEAT, are not among them."""
+
+
+def newest(frames: Sequence[bytes]) -> list[bytes]:
+    """Return the frames without the `STATES` that a later frame of the same sender replaces."""
+    kept: list[bytes] = []
+    replaced: set[bytes] = set()
+    for frame in reversed(frames):
+        if frame[_MESSAGE] in STATES:
+            sent_by = frame[_SENT_BY]
+            if sent_by in replaced:
+                continue
+            replaced.add(sent_by)
+        kept.append(frame)
+    kept.reverse()
+    return kept
 
 
 def split(frames: bytes) -> Iterator[bytes]:
@@ -17,11 +53,11 @@ def split(frames: bytes) -> Iterator[bytes]:
         start = end
 
 
-def newest_heartbeat(frames: bytes) -> bytes | None:
-    """Return the last HEARTBEAT of a sequence in which nothing is signed, None if there is none."""
+def newest_heartbeat(frames: Iterable[bytes]) -> bytes | None:
+    """Return the last HEARTBEAT among frames, None if there is none."""
     found = None
-    for frame in split(frames):
-        if frame[7:10] == b"\0\0\0":
+    for frame in frames:
+        if frame[_MESSAGE] == b"\0\0\0":
             found = frame
     return found
 

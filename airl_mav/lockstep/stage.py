@@ -83,7 +83,11 @@ class Stage:
         """Make the link."""
         # In the order of need: the companion's thread ends before its link does.
         self._open.enter_context(closing(self.firmware))
-        self.link = MavsdkLink(RAW_URL, self.clock, self.abandon, lambda: self.conductor.heard)
+        self.link = MavsdkLink(
+            *(RAW_URL, self.clock, self.abandon),
+            heard=lambda: self.conductor.heard,
+            poll=self.clock.poll,
+        )
         """The companion's link; `run` connects it."""
         self._open.enter_context(closing(self.link))
         self._open.enter_context(closing(self._partner))

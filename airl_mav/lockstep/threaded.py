@@ -9,16 +9,15 @@ its getters, and that everything it was told to send before has come out.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import replace
 from queue import Empty, SimpleQueue
 
 from airl_mav.core.clock import Patience
 from airl_mav.core.constants import US_PER_S
-from airl_mav.lockstep.frames import newest_heartbeat
+from airl_mav.lockstep.frames import newest, newest_heartbeat
 from airl_mav.lockstep.turns import Handle, LockstepError, Turn
-from companion.conducted import Abandoned
+from companion.conducted import Abandoned, Poll
 from companion.mavsdk_link import MavsdkLink
 from firmware_sim.mavlink.codec import Encoder, dialect
 
@@ -88,10 +87,11 @@ class ThreadPartner:
 
     # --- the conductor's thread
 
-    def send(self, frames: bytes) -> None:
-        """Feed MAVSDK."""
-        self._heartbeat = newest_heartbeat(frames) or self._heartbeat
-        self._feed(frames)
+    def send(self, frames: Sequence[bytes]) -> None:
+        """Feed MAVSDK, of states only the newest: it keeps no other for the companion."""
+        kept = newest(frames)
+        self._heartbeat = newest_heartbeat(kept) or self._heartbeat
+        self._feed(b"".join(kept))
 
     def turn(self, now_us: int, handle: Handle) -> Turn:
         """Let the companion work until it sleeps; see `turns.Partner`."""
@@ -106,9 +106,9 @@ class ThreadPartner:
             self._interrupted = True
             return Turn(now_us + LONGEST_ANSWER_US, turn, self._sent_before)
         # A command is answered before its caller goes on; a setpoint may still be under way.
-        if self._setpoints_sent != self._sent_before:
+        if turn.setpoints_sent != self._sent_before:
             self._settle(handle)
-        return replace(turn, setpoints_sent=self._setpoints_sent)
+        return turn
 
     def _settle(self, handle: Handle) -> None:
         """Wait until MAVSDK has taken in and sent out everything so far."""
@@ -157,9 +157,11 @@ class ThreadPartner:
 
     # --- the companion's thread
 
-    def sleep(self, wake_us: int, interrupt: threading.Event | None) -> None:
-        """Give the turn back until simulated `wake_us` [µs], or until `interrupt` is set."""
-        self._inbox.put(Turn(wake_us, interrupt))
+    def sleep(
+        self, wake_us: int, interrupt: threading.Event | None = None, poll: Poll | None = None
+    ) -> None:
+        """Give the turn back until simulated `wake_us` [µs]; see `conducted.Sleep`."""
+        self._inbox.put(Turn(wake_us, interrupt, self._setpoints_sent, poll))
         self._await_turn()
 
     def _await_turn(self) -> None:
@@ -175,7 +177,7 @@ class ThreadPartner:
             return
         except BaseException as error:  # handed to whoever conducts
             self.error = error
-        self._inbox.put(Turn(None))
+        self._inbox.put(Turn(None, setpoints_sent=self._setpoints_sent))
 
 
 def _is_ping(frame: bytes) -> bool:

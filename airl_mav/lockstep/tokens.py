@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 import select
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 from airl_mav.core.clock import WallClock
@@ -111,13 +111,13 @@ class TokenPartner:
 
     # --- turns.Partner
 
-    def send(self, frames: bytes) -> None:
+    def send(self, frames: Sequence[bytes]) -> None:
         """Pass on telemetry, at once if the companion is there."""
         self._heartbeat = newest_heartbeat(frames) or self._heartbeat
         if self._number == 0:
-            self._backlog.append(frames)
+            self._backlog += frames
         if self._heard:
-            self._wire.send(frames)
+            self._wire.send(b"".join(frames))
 
     def turn(self, now_us: int, handle: Handle) -> Turn:
         """Let the companion work until it sleeps; see `turns.Partner`."""

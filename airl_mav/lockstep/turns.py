@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol, TypeAlias
 
 from airl_mav.core.constants import US_PER_S
+from companion.conducted import Poll
 
 COMPANION_STARTS_US = US_PER_S // 10
 """The companion begins so long after the flight controller has booted [µs]."""
@@ -27,6 +28,8 @@ class Turn:
     """Wakes it earlier when set."""
     setpoints_sent: int = 0
     """Setpoints that it has handed to MAVSDK so far."""
+    poll: Poll | None = None
+    """Postpones `wake_us`; None: nothing does."""
 
 
 Handle: TypeAlias = "Callable[[bytes], threading.Event | None]"
@@ -38,8 +41,8 @@ to be interrupted until then."""
 class Partner(Protocol):
     """The companion as the conductor sees it, in a thread or behind a socket."""
 
-    def send(self, frames: bytes) -> None:
-        """Pass on telemetry; it is in the companion's hands when its next turn begins."""
+    def send(self, frames: Sequence[bytes]) -> None:
+        """Pass on telemetry, MAVLink frames; the companion has it when its next turn begins."""
         ...
 
     def turn(self, now_us: int, handle: Handle) -> Turn:
