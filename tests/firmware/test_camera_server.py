@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import pickle
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -12,9 +14,11 @@ from typing import Any, cast
 import numpy as np
 import pytest
 import zmq
+from numpy.typing import NDArray
 from PIL import Image
 
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape, Tour
+from airl_mav.camera.exposure import expose
 from airl_mav.camera.frame import MOST_BYTES, Frame
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.picture import render_picture
@@ -23,6 +27,7 @@ from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import quat_from_euler
 from airl_mav.profiles.camera_kind import CameraKind
+from airl_mav.profiles.conditions import SensorNoise
 from airl_mav.profiles.vehicle import load_vehicle
 from companion.camera import MESSAGES_PER_LOOK, ReceivedFrame, ZmqFrameSource
 from firmware_sim.plant.camera_server import CameraServer, SimulatedCamera
@@ -66,6 +71,61 @@ FRAME_LENS = Intrinsics.from_fov(64, 48, math.pi / 2)
 
 
 # --- the camera ----------------------------------------------------------------------------------
+
+
+def test_images_are_drawn_when_they_are_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the moment of the exposure, in any order, and the same in another process."""
+    arena, profile = (
+        room(12.0, pillar_at=6.0),
+        quad(camera={"width_px": 33, "height_px": 25}).camera,
+    )
+    north, turned = np.array([0.0, 0.0, -2.0]), quat_from_euler(0, 0, 0.3)
+    noise = SensorNoise(depth_noise=0.02)
+    cams = [SimulatedCamera(profile, arena, 0, noise, 5) for _ in range(2)]
+    times_us = range(0, 400_000, 100_000)
+    at_once = []
+    for at_us in times_us:
+        exposed = cams[0].capture(at_us, north + at_us * 1e-6, turned)
+        at_once.append((exposed.image.copy(), exposed.capture_time_us, exposed.sequence))
+    drawn: list[object] = []
+
+    def drawing(*seen: Any) -> NDArray[Any]:
+        drawn.append(seen)
+        return expose(*seen)
+
+    monkeypatch.setattr(cams[1]._eyes[""], "_expose", drawing)
+    place, frames = north.copy(), []
+    for at_us in times_us:
+        place[:] = north + at_us * 1e-6
+        frames.append(cams[1].capture(at_us, place, turned))
+    assert not drawn
+    assert len({image.tobytes() for image, *_ in at_once}) == len(at_once)
+    for (image, *stamps), late in reversed(list(zip(at_once, frames, strict=True))):
+        np.testing.assert_array_equal(late.image, image)
+        assert [late.capture_time_us, late.sequence] == stamps
+    _ = frames[0].image
+    assert len(drawn) == len(frames)
+    copied = pickle.loads(pickle.dumps(frames[0]))  # noqa: S301 (our own)
+    assert copied.to_bytes() == frames[0].to_bytes()
+
+
+def test_a_gain_that_follows_the_light_draws_every_image() -> None:
+    """Each depends on the one before: a frame that is read has the gain of all of them."""
+    slow = {"auto_exposure": {"time_constant_s": 0.5}}
+    seen = {"width_px": 33, "height_px": 25, "kind": "grey", "imaging": slow}
+    profile, arena = quad(camera=seen).camera, room(12.0, pillar_at=2.0)
+
+    def last(yaws: Sequence[float]) -> Frame:
+        cam = SimulatedCamera(profile, arena)
+        frames = [take(cam, 400_000 + 33_000 * i, yaw) for i, yaw in enumerate(yaws)]
+        return frames[-1]
+
+    image = last([0.0, 1.5, 3.0]).image
+    assert not np.array_equal(image, last([3.0]).image)
+    cam = SimulatedCamera(profile, arena)
+    for i, yaw in enumerate([0.0, 1.5, 3.0]):
+        read = take(cam, 400_000 + 33_000 * i, yaw).image
+    np.testing.assert_array_equal(image, read)
 
 
 @pytest.mark.parametrize("rate_hz", [1.0, 7.0, 10.0, 29.97, 30.0, 60.0, 90.0, 125.0])

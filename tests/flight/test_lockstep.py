@@ -6,8 +6,9 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -24,10 +25,11 @@ from airl_mav.latency.samplers import FixedSampler
 from airl_mav.lockstep import stage as stage_module
 from airl_mav.lockstep.digest import LANES
 from airl_mav.lockstep.flight import fly
+from airl_mav.lockstep.frames import newest
 from airl_mav.lockstep.inbound import REPEAT_US, Inbound
 from airl_mav.lockstep.stage import Stage
 from airl_mav.lockstep.threaded import ThreadPartner
-from airl_mav.lockstep.turns import Handle, LockstepError
+from airl_mav.lockstep.turns import Handle, LockstepError, Turn
 from airl_mav.policy.actions import Action
 from airl_mav.policy.observation import Observation
 from airl_mav.profiles.conditions import WindSettings
@@ -36,9 +38,11 @@ from airl_mav.rehearsal.run_folder import FlownEpisode
 from airl_mav.scenario.model import LimitSettings, PilotSettings, WatchdogSettings
 from airl_mav.scenario.piloting import TRANSPORT_US
 from airl_mav.scenario.resolved import ResolvedScenario
+from companion.conducted import Poll
 from companion.interfaces import BodyVelocity
 from companion.mission import fly_mission
 from firmware_sim.autopilot.failsafes.supervisor import LOOK_US
+from firmware_sim.mavlink.codec import Encoder
 from firmware_sim.simulation import EpisodeSetup
 from tests.support import lockstep_kit
 from tests.support.full_disk import largest_file
@@ -134,6 +138,37 @@ def test_reruns_under_load_are_the_same(
         assert rerun.latency.keys() == reference.latency.keys()
         for name, values in reference.latency.items():
             np.testing.assert_array_equal(rerun.latency[name], values)
+
+
+def test_waits_take_few_turns_and_are_the_flight_that_polls(
+    scenario: ResolvedScenario, reference: FlownEpisode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With all telemetry fed, and a turn for every look at it."""
+    turns: list[int] = []
+
+    class Counting(ThreadPartner):
+        def turn(self, now_us: int, handle: Handle) -> Turn:
+            turns[-1] += 1
+            return super().turn(now_us, handle)
+
+    class Polling(Counting):
+        def send(self, frames: Sequence[bytes]) -> None:
+            self._feed(b"".join(frames))
+
+        def sleep(
+            self,
+            wake_us: int,
+            interrupt: threading.Event | None = None,
+            poll: Poll | None = None,
+        ) -> None:
+            super().sleep(wake_us, interrupt)
+
+    for partner in (Counting, Polling):
+        turns.append(0)
+        monkeypatch.setattr(stage_module, "ThreadPartner", partner)
+        assert flown(scenario).record == reference.record
+    few, many = turns
+    assert 3 * few < many
 
 
 @pytest.mark.nightly
@@ -403,6 +438,24 @@ class Sdk:
 
 def decoded(frame: bytes) -> dialect.MAVLink_message:
     return dialect.MAVLink(None).decode(bytearray(frame))
+
+
+def test_of_states_the_newest_is_fed_and_everything_else_in_its_place() -> None:
+    vehicle, other = Encoder(), Encoder(component_id=158)
+    zeros = (0.0,) * 3
+
+    def attitude(by: Encoder, boot_ms: int) -> bytes:
+        return by.pack(dialect.MAVLink_attitude_message(boot_ms, *zeros, *zeros))
+
+    def text(words: bytes) -> bytes:
+        return vehicle.pack(dialect.MAVLink_statustext_message(6, words))
+
+    ping = vehicle.pack(dialect.MAVLink_ping_message(0, 1, 0, 0))
+    frames = [
+        *(attitude(vehicle, 1), text(b"one"), attitude(other, 2), ping),
+        *(attitude(vehicle, 3), text(b"one"), ping),
+    ]
+    assert newest(frames) == frames[1:]
 
 
 def test_repetitions_by_the_wall_clock_are_dropped() -> None:
