@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from airl_mav.core.errors import UsageError
-from airl_mav.experiments import behaviour
 from airl_mav.profiles.conditions import Payload
+from published import behaviour
 from published.behaviour import (
     Behaviour,
     differences,
