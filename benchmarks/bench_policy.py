@@ -27,9 +27,10 @@ from airl_mav.policy.observation import Kinematics, encode
 from airl_mav.policy.registry import find_policy
 from airl_mav.scenario.model import DEFAULT_POLICY
 from airl_mav.training.algorithms import make_model
-from airl_mav.training.config import TrainingConfig
+from airl_mav.training.config import AlgorithmSpec, TrainingConfig
 from airl_mav.training.export import network_of
 from airl_mav.training.onnx_export import random_inputs
+from airl_mav.training.table import ALGORITHMS
 
 CALLS = 5000
 WARM_UP = 200
@@ -57,7 +58,10 @@ def main() -> None:
     runtime = open_model(folder, card)
     config = TrainingConfig.model_validate(card.training.config)
     env = NavigationVecEnv(NavigationVectorEnv(1, config.environment))
-    learner = make_model(config.algorithm, config.network, env, 0)
+    # A card lists the fields of all algorithms, and make_model rejects those of the others.
+    fields = {"name", "options", *ALGORITHMS[config.algorithm.name].fields}
+    algorithm = AlgorithmSpec.model_validate(config.algorithm.model_dump(include=fields))
+    learner = make_model(algorithm, config.network, env, 0)
     network = network_of(learner, tuple(inputs)).eval()
     tensors = tuple(torch.from_numpy(array) for array in inputs.values())
     learned = load_learned(folder, rng=rng)
