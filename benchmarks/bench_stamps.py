@@ -28,9 +28,11 @@ from rich.console import Console
 from rich.table import Table
 
 from airl_mav.core.clock import WallClock
+from airl_mav.core.constants import CommandKind
+from airl_mav.core.goals import Goal
 from airl_mav.core.progress import Bar
 from airl_mav.latency.stamps import DecisionLog
-from airl_mav.policy.actions import Action, limited
+from airl_mav.policy.actions import AnyAction, flyable
 from airl_mav.policy.observation import Kinematics, Observation
 from airl_mav.profiling import hil
 from airl_mav.profiling.bare import BareLoop
@@ -79,22 +81,22 @@ def watched() -> Iterator[list[int]]:
         of: pilot.Pilot,
         seen: ReceivedFrame,
         state: Kinematics,
-        goal: tuple[float, float],
+        goal: Goal,
         now_us: int,
     ) -> Observation:
         nonlocal started_ns
         started_ns = time.perf_counter_ns()
         return encode(of, seen, state, goal, now_us)
 
-    def limited_timed(action: Action, speed_m_s: float) -> Action:
-        bounded = limited(action, speed_m_s)
+    def flyable_timed(action: AnyAction, commands: CommandKind, speed_m_s: float) -> AnyAction:
+        bounded = flyable(action, commands, speed_m_s)
         took_ns.append(time.perf_counter_ns() - started_ns)
         return bounded
 
     # Raises AttributeError where the pilot has no such name any more.
     with (
         patch.object(pilot.Pilot, "_observe", encode_timed),
-        patch.object(pilot, "limited", limited_timed),
+        patch.object(pilot, "flyable", flyable_timed),
     ):
         yield took_ns
 
