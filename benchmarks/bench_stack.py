@@ -143,6 +143,7 @@ def hover(
     vehicle: VehicleProfile,
     links: Sequence[Callable[[MemoryEndpoint], LinkConfig]],
     begins: Callable[[], None] = lambda: None,
+    flight_s: float = FLIGHT_S,
 ) -> Timed:
     """Fly slowly by setpoints; the links' frames are packed and thrown away."""
     setup = EpisodeSetup(vehicle, None, 1)
@@ -166,7 +167,7 @@ def hover(
     every = round(0.05 / TICK_S)
     begins()
     timer = Timer()
-    for i in range(round(FLIGHT_S / TICK_S)):
+    for i in range(round(flight_s / TICK_S)):
         if i % every == 0:
             autopilot.offer_setpoint(setpoint, simulation.time_us)
         if server is not None:
@@ -176,7 +177,7 @@ def hover(
             server.send(simulation.time_us)
             for endpoint in endpoints:
                 endpoint.take()
-    timed = timer.timed(FLIGHT_S)
+    timed = timer.timed(flight_s)
     simulation.close()
     return timed
 
@@ -185,11 +186,11 @@ def lockstep(policy: str) -> ResolvedScenario:
     return resolve(Scenario(policy=policy, level="lockstep"))
 
 
-def whole(resolved: ResolvedScenario) -> Timed:
+def whole(resolved: ResolvedScenario, seeds: Sequence[int] = SEEDS) -> Timed:
     """Fly some episodes from boot to disarming, all that belongs to them included."""
     simulated_us = 0
     timer = Timer()
-    for seed in SEEDS:
+    for seed in seeds:
         flown = fly(resolved, resolved.fresh_policy(seed), 0, seed)
         path = flown.trajectory.time_us
         simulated_us += int(path[-1] - path[0]) + TICK_US
