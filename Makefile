@@ -53,11 +53,16 @@ sitl: $(FLY)  ## Fly three episodes: airl-sitl --vehicle quad
 	$(BIN)/airl-sitl --vehicle quad
 
 .PHONY: lint
-lint: $(ALL)  ## Format, lint, types, import contracts
+lint: $(ALL)  ## Format, lint, types, import contracts, budgets
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python scripts/check_budgets.py
+
+.PHONY: budgets
+budgets: $(ALL)  ## Lower scripts/budgets.toml to what is measured now, calls per tick included
+	$(BIN)/python scripts/check_budgets.py --lower --calls
 
 # What every worker of the tests would compile for itself: kernels, and modules. Kernels need what
 # flies and nothing else; while pip installs the package once more, it is found by its place.
@@ -99,6 +104,7 @@ bench: $(ALL)  ## Measure: ray caster, stack, environments (RIVALS="--pyflyt-pyt
 	$(BIN)/python benchmarks/bench_depth.py
 	$(BIN)/python benchmarks/bench_colour.py
 	$(BIN)/python benchmarks/bench_stack.py
+	$(BIN)/python benchmarks/bench_calls.py
 	$(BIN)/python benchmarks/bench_policy.py
 	$(BIN)/python benchmarks/bench_compensation.py
 	$(BIN)/python benchmarks/bench_stamps.py
