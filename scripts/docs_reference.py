@@ -35,6 +35,8 @@ from airl_mav.core.fields import range_of, unit_of  # noqa: E402
 HELP_COLUMNS = "100"
 """Width that help texts are wrapped at."""
 
+_WHERE = re.compile(r"([\w.]+):(\w+)(?:\[(.+)\]\.(\w+))?")
+
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Replace the comments of a page (mkdocs calls this for every page)."""
@@ -52,9 +54,14 @@ def _generated(match: re.Match[str]) -> str:
 
 
 def field_tables(where: str) -> str:
-    """Return the tables of a model, "MODULE:NAME": its own fields, then each model inside it."""
-    module, name = where.split(":")
+    """Return the tables of a model and of each model inside it.
+
+    Args:
+        where: "MODULE:NAME", or "MODULE:TABLE[KEY].FIELD" for the model in a row of a table.
+    """
+    module, name, key, field = _WHERE.fullmatch(where).groups()  # type: ignore[union-attr]
     model = getattr(importlib.import_module(module), name)
+    model = model if key is None else getattr(model[key], field)
     tables = []
     for path, part in _models(model, ""):
         title = f"### `{path}`\n\n{_summary(part)}\n\n" if path else ""
