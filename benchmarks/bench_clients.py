@@ -166,6 +166,8 @@ def serve(pipe: Connection) -> None:
 class Pacing:
     """As fast as possible until `paced`, then in real time; notes how late ticks begin."""
 
+    quiet_until_us = 0.0
+
     def __init__(self) -> None:
         self._wall = WallPacing(1.0)
         self.slipped_us = 0

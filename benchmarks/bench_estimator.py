@@ -40,7 +40,7 @@ from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import Mode, Result, Setpoint
 from firmware_sim.autopilot.commander import Phase
 from firmware_sim.autopilot.estimator import BIAS_STEP_S
-from firmware_sim.plant.sensors import PA_PER_HPA
+from firmware_sim.engine.ticks import PA_PER_HPA
 from firmware_sim.simulation import EpisodeSetup, Simulation, builtin_autopilot
 
 ALTITUDE_M = 8.0

@@ -45,6 +45,7 @@ from firmware_sim.simulation import EpisodeSetup, Simulation, builtin_autopilot
 FLIGHT_S = 30.0
 REPEATS = 3
 SEEDS = (1, 2, 3, 4, 5)
+SETPOINT_US = 50_000
 
 
 class Stopwatches:
@@ -164,19 +165,19 @@ def hover(
     if links:
         opened = [link(endpoint) for link, endpoint in zip(links, endpoints, strict=True)]
         server = MavlinkServer(opened, autopilot, boot_unix_us=0)
-    every = round(0.05 / TICK_S)
     begins()
     timer = Timer()
-    for i in range(round(flight_s / TICK_S)):
-        if i % every == 0:
-            autopilot.offer_setpoint(setpoint, simulation.time_us)
-        if server is not None:
-            server.receive(simulation.time_us)
-        simulation.tick()
-        if server is not None:
-            server.send(simulation.time_us)
-            for endpoint in endpoints:
-                endpoint.take()
+    start_us = simulation.time_us
+    for i in range(round(flight_s * US_PER_S / SETPOINT_US)):
+        autopilot.offer_setpoint(setpoint, simulation.time_us)
+        while simulation.time_us < start_us + (i + 1) * SETPOINT_US:
+            if server is not None:
+                server.receive(simulation.time_us)
+            simulation.advance(start_us + (i + 1) * SETPOINT_US)
+            if server is not None:
+                server.send(simulation.time_us, simulation.flown)
+                for endpoint in endpoints:
+                    endpoint.take()
     timed = timer.timed(flight_s)
     simulation.close()
     return timed

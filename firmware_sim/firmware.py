@@ -17,6 +17,7 @@ from airl_mav.profiles.camera_kind import SLOW, Renderer
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import Message, Severity
 from firmware_sim.autopilot.parameter_store import Keeper
+from firmware_sim.engine.record import Record
 from firmware_sim.faults.link import FailingEndpoint
 from firmware_sim.flight_controller import FlightController
 from firmware_sim.flight_log.flight_log import FlightLog
@@ -91,8 +92,13 @@ class FlightStack(Protocol):
         """Take what has arrived at simulated time `now_us` [µs]; return how much took effect."""
         ...
 
-    def send(self, now_us: int) -> None:
-        """Send what is due; once a tick."""
+    def send(self, now_us: int, flown: Record) -> None:
+        """Send what is due.
+
+        Args:
+            now_us: Simulated time after the newest tick [µs].
+            flown: (n,) logs of the ticks since the last call; empty where the firmware is external.
+        """
         ...
 
     def log_to(self, tlog: TlogWriter | None) -> None:
@@ -152,8 +158,8 @@ class BuiltinFlightStack:
         self._save()
         self._server.close()
 
-    def _send_and_save(self, now_us: int) -> None:
-        self._server.send(now_us)
+    def _send_and_save(self, now_us: int, flown: Record) -> None:
+        self._server.send(now_us, flown)
         self._now_us = now_us
         if self._save_us is not None and now_us >= self._save_us:
             self._save()
@@ -200,7 +206,9 @@ class Firmware:
         self.clock = pacing.clock
         self.simulation: Simulation | None = None
         self.on_tick: Callable[[Simulation], None] | None = None
-        """Called after every tick, if set."""
+        """Called after every tick, if set: then no more than one is flown at a time."""
+        self.on_ticks: Callable[[Simulation], None] | None = None
+        """Called after the ticks of each `step`, if set (`Simulation.truths`)."""
         self.on_frame: Callable[[Frame], None] | None = None
         """Called with every frame of the camera, before it is published, if set."""
         self.on_message: Callable[[Message], None] | None = None
@@ -348,18 +356,17 @@ class Firmware:
             simulation.capture_due(
                 self._camera.publish if self.on_frame is None else self._show_and_publish
             )
-        log = self._flight_log
-        if log is None:
-            simulation.tick()
-        else:
-            log.before_tick(simulation.time_us, simulation.plant.truth)
-            simulation.tick()
-            internals = simulation.autopilot.internals
-            if internals is not None and internals.sample is not None:
-                log.after_tick(internals.sample, internals.state)
-        flight_stack.send(simulation.time_us)
-        if self.on_tick is not None:
-            self.on_tick(simulation)
+        until_us = 0.0 if self.on_tick is not None else self._pacing.quiet_until_us
+        if self._camera is not None:
+            until_us = min(until_us, simulation.next_frame_us)
+        log, internals = self._flight_log, simulation.autopilot.internals
+        simulation.advance(until_us)
+        if log is not None and internals is not None:
+            log.after_ticks(simulation.flown, simulation.truths, internals.state())
+        flight_stack.send(simulation.time_us, simulation.flown)
+        for listen in (self.on_tick, self.on_ticks):
+            if listen is not None:
+                listen(simulation)
 
     def _show_and_publish(self, frame: Frame) -> None:
         if self.on_frame is not None:

@@ -41,6 +41,11 @@ class Pacing(Protocol):
         """Host monotonic time of simulated time 0 [ns]; None when it is not paced."""
         ...
 
+    @property
+    def quiet_until_us(self) -> float:
+        """Simulated time before which nothing can arrive [µs]; 0 = at any tick."""
+        ...
+
     def restart(self, tick_us: int) -> None:
         """Declare that it is simulated `tick_us` now: time before that belongs to no episode."""
         ...
@@ -62,6 +67,8 @@ class Pacing(Protocol):
 
 class WallPacing:
     """Runs every tick at its wall time."""
+
+    quiet_until_us = 0.0
 
     def __init__(self, speed: float) -> None:
         """Take the speed: simulated seconds per wall second, > 0.
@@ -144,6 +151,7 @@ class Unpaced:
 
     epoch_ns = None
     slipped_us = 0
+    quiet_until_us = 0.0
 
     def __init__(self) -> None:
         self.clock = SimClock()

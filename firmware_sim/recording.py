@@ -8,13 +8,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.core.frames import Vector
 from airl_mav.flight.trajectory import TrajectoryRecorder
 from airl_mav.latency.stamps import NO_STAMP
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
-from firmware_sim.autopilot.autopilot_state import Estimate, Wire
+from firmware_sim.autopilot.autopilot_state import Wire
+from firmware_sim.autopilot.error_state import RATES, P, Q, V
+from firmware_sim.engine.record import Record
 from firmware_sim.faults.timeline import Acted
-from firmware_sim.plant.kinematics import POSE
-from firmware_sim.plant.plant import Plant
 
 
 class SetpointLog:
@@ -116,8 +117,10 @@ class FlightRecorder:
     def begin(self) -> None:
         """Forget the path so far: the episode begins now."""
         self._trajectory = TrajectoryRecorder()
-        self._estimates: list[Estimate] = []
-        """As old as the samples of the trajectory, less one tick: what the motors were told by."""
+        self._estimates: list[Vector] = []
+        """Position, velocity, attitude (10,) as old as the samples of the trajectory, less one
+        tick: what the motors were told by."""
+        self._estimated_us: list[int] = []
         self._lateness_us: list[int] = []
         self._slips: list[tuple[int, int]] = []
 
@@ -135,17 +138,23 @@ class FlightRecorder:
         if self._internals is not None and self.setpoints.fresh:
             self.setpoints.take(self._internals.ticks_to_motors)
 
-    def after_controls(self, time_us: int) -> None:
-        """Note that it has returned motor commands, at `time_us` [µs]."""
-        if self.setpoints.pending:
-            self.setpoints.ticked(time_us)
+    def flown(self, truths: Record, flown: Record, first_us: int) -> None:
+        """Take the newest ticks.
 
-    def moved(self, plant: Plant) -> None:
-        """Note the state after a tick of the plant."""
-        if self._trajectory.integrate(plant.time_us, plant.power_w):
-            self._trajectory.keep(plant.motion[POSE])
+        Args:
+            truths: (n,) log of the aircraft.
+            flown: (n,) log of the flight controller; empty = nobody can look into it.
+            first_us: When the first of them had its motor commands [µs].
+        """
+        setpoints, times = self.setpoints, truths["time_us"].tolist()
+        for time_us in times:
+            if not setpoints.pending:
+                break
+            setpoints.ticked(first_us + time_us - times[0])
+        for k in self._trajectory.extend(times, truths["power_w"].tolist(), truths["motion"]):
             if self._internals is not None:
-                self._estimates.append(self._internals.estimator.estimate())
+                self._estimates.append(flown["state"][k, :RATES].copy())
+                self._estimated_us.append(flown["time_us"].item(k))
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return what was recorded so far, by the names of its file (docs/run-folder.md)."""
@@ -159,10 +168,10 @@ class FlightRecorder:
             return arrays
         for name, values in self.setpoints.arrays().items():
             arrays[f"setpoints/{name}"] = values
-        estimates = self._estimates
+        estimates = np.array(self._estimates).reshape(-1, RATES)
         return arrays | {
-            "estimate/time_us": np.array([e.time_us for e in estimates], np.int64),
-            "estimate/position": np.array([e.position for e in estimates]).reshape(-1, 3),
-            "estimate/velocity": np.array([e.velocity for e in estimates]).reshape(-1, 3),
-            "estimate/quaternion": np.array([e.quaternion for e in estimates]).reshape(-1, 4),
+            "estimate/time_us": np.array(self._estimated_us, np.int64),
+            "estimate/position": estimates[:, P:V],
+            "estimate/velocity": estimates[:, V:Q],
+            "estimate/quaternion": estimates[:, Q:],
         }

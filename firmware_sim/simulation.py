@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
@@ -13,6 +14,7 @@ from airl_mav.arena.geometry import Arena
 from airl_mav.camera.frame import Frame
 from airl_mav.camera.render import Motion
 from airl_mav.core.clock import Clock
+from airl_mav.core.constants import TICK_US
 from airl_mav.core.streams import Stream, stream
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import Aircraft
@@ -21,6 +23,9 @@ from airl_mav.vehicle.spread import draw_airframe
 from airl_mav.vehicle.wind import wind_of_episode
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.parameter_store import Keeper, Parameters
+from firmware_sim.engine.kinematics import POSITION, QUATERNION, RATES, VELOCITY
+from firmware_sim.engine.record import FLOWN_TICK, TRUE_TICK
+from firmware_sim.engine.ticks import COLLIDED, FUSE, log_flown_record, log_record
 from firmware_sim.faults.camera import FailingCamera
 from firmware_sim.faults.controller import FailingParts
 from firmware_sim.faults.injection import ClientFaults
@@ -29,11 +34,13 @@ from firmware_sim.flight_controller import FlightController
 from firmware_sim.hover_start import HoverStart
 from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth
 from firmware_sim.plant.camera_server import SimulatedCamera
-from firmware_sim.plant.kinematics import POSITION, QUATERNION, RATES, VELOCITY
 from firmware_sim.plant.onboard_camera import CameraMaker, OnboardCamera
 from firmware_sim.plant.plant import Plant
 from firmware_sim.recording import FlightRecorder, fault_arrays
 from firmware_sim.simulation_snapshot import SimulationSnapshot
+
+MOST_TICKS = 250
+"""Ticks that are flown at a time, at most: a second."""
 
 
 @dataclass(frozen=True)
@@ -117,6 +124,8 @@ class Simulation:
         self.faults: FaultTimeline | None = None
         """What fails in this episode; None: nothing does."""
         self._fly: Callable[[SensorSample], ActuatorControls] = self.autopilot.step
+        self._unaltered = self._fly
+        """What flies where nothing fails."""
         self._setup = setup
         if asked.faults:
             self._let_fail(start_us)
@@ -139,6 +148,12 @@ class Simulation:
         self.start_us = start_us
         self.time_us = start_us
         """Simulated time of the newest sample."""
+        self._truths = np.zeros(MOST_TICKS, TRUE_TICK)
+        self._flown = np.zeros(MOST_TICKS, FLOWN_TICK)
+        self.truths = self._truths[:0]
+        """Log of the aircraft in the newest ticks (`engine.record.TRUE_TICK`)."""
+        self.flown = self._flown[:0]
+        """Log of the built-in flight controller in them (`engine.record.FLOWN_TICK`)."""
         self._clock = clock
         self._sample: SensorSample = self.plant.sense()
 
@@ -172,17 +187,79 @@ class Simulation:
 
     def tick(self) -> None:
         """Run autopilot, then plant, for one tick."""
-        plant, recorder = self.plant, self.recorder
+        self.advance(self.time_us)
+
+    def advance(self, until_us: float) -> None:
+        """Fly ticks as long as they begin before simulated `until_us` [µs], and one at least.
+
+        It may end earlier: when something is detected, or has to be decided.
+        """
+        plant, recorder, autopilot = self.plant, self.recorder, self.autopilot.internals
+        first_us = self._clock.time_us()
         if recorder is None:
             plant.collisions.clear()
-            self._sample = plant.step(self._fly(self._sample))
         else:
             recorder.before_controls()
-            controls = self._fly(self._sample)
-            recorder.after_controls(self._clock.time_us())
-            self._sample = plant.step(controls)
-            recorder.moved(plant)
+        if autopilot is None or not self._is_compiled(autopilot):
+            done = self._tick_by_python(autopilot)
+        else:
+            done = self._stretch(autopilot, until_us)
         self.time_us = plant.time_us
+        self.truths = self._truths[:done]
+        self.flown = self._flown[: 0 if autopilot is None else done]
+        if recorder is not None:
+            recorder.flown(self.truths, self.flown, first_us)
+
+    def _is_compiled(self, autopilot: BuiltinAutopilot) -> bool:
+        """Return whether compiled ticks fly as Python's do: no fault, no sensor beyond GPS."""
+        return self._fly is self._unaltered and self.plant.compiled and autopilot.compiled
+
+    def _tick_by_python(self, autopilot: BuiltinAutopilot | None) -> int:
+        """Fly a tick whose sample or commands are not the engine's; return 1."""
+        self._sample = self.plant.step(self._fly(self._sample))
+        log_record(self.plant.record, self._truths)
+        if autopilot is not None:
+            log_flown_record(autopilot.record, self._flown)
+            self._flown["battery"][0] = self._sample.battery
+            if self._fly is self._unaltered:
+                autopilot.take(self._sample)  # as compiled ticks do
+        return 1
+
+    def _stretch(self, autopilot: BuiltinAutopilot, until_us: float) -> int:
+        """Fly compiled ticks; return how many."""
+        autopilot.take(self._sample)
+        plant, done = self.plant, 0
+        most = max(1, math.ceil(min((until_us - self.time_us) / TICK_US, MOST_TICKS)))
+        while done < most:
+            due_us = autopilot.decide_if_due()
+            ticks = max(1, math.ceil(min((due_us - plant.time_us) / TICK_US, most - done)))
+            flown, event = self._glide(autopilot, done, done + ticks)
+            done += flown
+            self._sample = plant.newest()
+            changed = autopilot.flown(self._sample)
+            # After what Python fuses, other aids may be in use.
+            if changed or event == COLLIDED or not autopilot.compiled:
+                break
+        return done
+
+    def _glide(self, autopilot: BuiltinAutopilot, first: int, end: int) -> tuple[int, int]:
+        """Fly ticks at a constant demand into the logs; return how many, and the last event."""
+        plant, record, done, event = self.plant, autopilot.record, first, FUSE
+        while event == FUSE and done < end:
+            flown, event = plant.glide(
+                record, end - done, self._truths[done:end], self._flown[done:end]
+            )
+            done += flown
+            if event == FUSE:
+                done += 1
+                if autopilot.fuse(plant.newest(), record["left"].item(0)) or record["detected"][0]:
+                    break
+        return done - first, event
+
+    @property
+    def next_frame_us(self) -> float:
+        """When the camera exposes its next frame [µs]; inf on an endless floor."""
+        return math.inf if self._camera is None else self._camera.next_us
 
     def capture_due(self, publish: Callable[[Frame], None]) -> None:
         """Hand a depth frame to `publish` when the camera is due; an endless floor has none."""

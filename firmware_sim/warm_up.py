@@ -12,20 +12,21 @@ import numpy as np
 
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena
-from airl_mav.control.controller import Controller
 from airl_mav.control.demand import AttitudeDemand, RateDemand, TrajectoryDemand
 from airl_mav.control.gains import Gains
 from airl_mav.core.clock import SimClock
-from airl_mav.core.constants import GRAVITY_M_S2, TICK_S
+from airl_mav.core.constants import GRAVITY_M_S2
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import DEFAULT_PLANT, Aircraft, PlantName
 from firmware_sim.autopilot.error_state import INITIAL_SIGMA, new_state
 from firmware_sim.autopilot.filter_kernel import KernelFilter
+from firmware_sim.autopilot.land_detector import LandDetector
 from firmware_sim.autopilot.range_finder import Aids, RangeFinder
 from firmware_sim.autopilot.terrain_filter import TerrainFilter
 from firmware_sim.autopilot.yaw_estimator import YawEstimator
+from firmware_sim.engine.controller import Controller
 from firmware_sim.interfaces import DistanceReading
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from firmware_sim.mavlink.link import gcs_link, onboard_link
@@ -41,6 +42,9 @@ ARMED_TICKS = 60
 
 GROUND_STEPS, GROUND_STEP_US = 30, 50_000
 """Ranges on the ground, and as many in the air: more than EKF2_RNG_QLTY_T."""
+
+HIGH_M = 20.0
+"""Above all obstacles [m]."""
 
 HOVER = np.array([0.0, 0.0, -GRAVITY_M_S2])
 """Specific force (3,) of a vehicle that hovers level, FRD [m/s²]."""
@@ -91,16 +95,21 @@ def _fly(vehicle: VehicleProfile, plant: PlantName, arena: Arena | None) -> None
                 armed += 1
             if armed == ARMED_TICKS:
                 break
+        # Away from everything that it could touch.
+        simulation.plant.put((0.0, 0.0, -HIGH_M))
+        for _ in range(ARMED_TICKS):
+            simulation.tick()
     finally:
         simulation.close()
     _fly_every_kind(autopilot.parameters.value)
     _fuse_in_the_air()
+    _detect_ground(autopilot.parameters.value)
     _measure_the_ground(autopilot.parameters.value)
 
 
 def _fly_every_kind(value: Callable[[str], float]) -> None:
     """Run the cascade once for every kind of demand: some modes fly by attitude or rates."""
-    controller = Controller(Gains.from_parameters(value), TICK_S)
+    controller = Controller(Gains.from_parameters(value))
     state = np.zeros(13)
     state[6] = 1.0
     nothing = (0.0, 0.0, 0.0)
@@ -114,6 +123,13 @@ def _fuse_in_the_air() -> None:
     estimator = YawEstimator()
     estimator.feel(np.zeros(3), HOVER)
     estimator.observe(np.zeros(3), 0.5, np.zeros(3), flying=True)
+
+
+def _detect_ground(value: Callable[[str], float]) -> None:
+    """Ask the land detector: compiled ticks do without its Python."""
+    detector, state = LandDetector(value), new_state()
+    detector.landed(state, 0, 0.0, descending=True)
+    detector.lifted(state, 0.0)
 
 
 def _measure_the_ground(value: Callable[[str], float]) -> None:

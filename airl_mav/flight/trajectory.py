@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -137,6 +137,26 @@ class TrajectoryRecorder:
         self._energy_uj += power_w * (time_us - last_us)
         self._last_us = time_us
         return time_us - self._kept_us >= SAMPLE_US or not self._times
+
+    def extend(
+        self, times_us: Sequence[int], powers_w: Sequence[float], states: NDArray[np.float64]
+    ) -> list[int]:
+        """Take n ticks; return which of them were sampled.
+
+        Args:
+            times_us: (n,) simulated time [µs].
+            powers_w: (n,) electrical power over the tick that ends then [W].
+            states: (n, >= 10) as `keep` takes them; copied.
+        """
+        kept = []
+        for k, (time_us, power_w) in enumerate(zip(times_us, powers_w, strict=True)):
+            last_us, self._last_us, self._power_w = self._last_us, time_us, power_w
+            if last_us is not None:
+                self._energy_uj += power_w * (time_us - last_us)
+            if time_us - self._kept_us >= SAMPLE_US or not self._times:
+                self.keep(states[k, :10].copy())
+                kept.append(k)
+        return kept
 
     def keep(self, state: NDArray[np.float64]) -> None:
         """Sample the moment of the newest `integrate`.

@@ -24,6 +24,7 @@ from airl_mav.policy.actions import Action, AnyAction, BodyRates
 from airl_mav.policy.observation import Observation
 from airl_mav.rehearsal.run_folder import FlownEpisode
 from airl_mav.scenario.resolved import ResolvedScenario
+from firmware_sim.engine.record import TRUE_TICK
 from firmware_sim.simulation import Simulation
 
 VERDICTS = {
@@ -143,21 +144,25 @@ class _Account:
         self._simulation: Simulation | None = None
         self._referee: Referee | None = None
         self._hit: str | None = None
-        self._here: tuple[float, float, float] | None = None
+        self._newest = np.zeros((), TRUE_TICK)
+        """The newest of them, or that of the verdict."""
         self._distance_m = self._energy_j = 0.0
         self._at_verdict: Flights | None = None
 
     def ticked(self, simulation: Simulation, referee: Referee, hit: str | None) -> None:
-        """Take the true state after a tick."""
-        plant = simulation.plant
-        before, self._here = self._here, plant.position
+        """Take the true states of the newest ticks."""
+        truths, verdict = simulation.truths, referee.verdict
         self._simulation, self._referee, self._hit = simulation, referee, hit
         if referee.navigation_us is None or self._at_verdict is not None:
+            self._newest = truths[-1].copy()
             return
-        if before is not None:
-            self._distance_m += math.dist(before, plant.position)
-        self._energy_j += plant.power_w * TICK_S
-        if referee.verdict is not None:
+        if verdict is not None:
+            truths = truths[truths["time_us"] <= verdict.time_us]
+        places = np.vstack([self._newest["motion"][None, :3], truths["motion"][:, :3]])
+        self._distance_m += float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
+        self._energy_j += float(truths["power_w"].sum()) * TICK_S
+        self._newest = truths[-1].copy()
+        if verdict is not None:
             self._at_verdict = self._now()
 
     def flights(self) -> Flights:
@@ -182,17 +187,18 @@ class _Account:
         return self._simulation, self._referee
 
     def _now(self) -> Flights:
-        simulation, referee = self._flown()
-        truth, outcome = simulation.truth, self.outcome()
-        began_us = simulation.time_us if referee.navigation_us is None else referee.navigation_us
+        _, referee = self._flown()
+        tick, outcome = self._newest, self.outcome()
+        time_us, motion = int(tick["time_us"]), tick["motion"]
+        began_us = time_us if referee.navigation_us is None else referee.navigation_us
         return Flights(
             verdict=np.array([Verdict.FLYING if outcome is None else VERDICTS[outcome]], np.int64),
-            time_s=np.array([(simulation.time_us - began_us) / US_PER_S]),
+            time_s=np.array([(time_us - began_us) / US_PER_S]),
             distance_m=np.array([self._distance_m]),
             energy_j=np.array([self._energy_j]),
-            goal_distance_m=np.array([goal_distance_m(referee.task.goal, truth.position)]),
-            speed_m_s=np.array([np.linalg.norm(truth.velocity)]),
-            battery=np.array([truth.battery_remaining]),
+            goal_distance_m=np.array([goal_distance_m(referee.task.goal, motion[:3])]),
+            speed_m_s=np.array([np.linalg.norm(motion[3:6])]),
+            battery=np.array([tick["charge"]]),
             touched=np.array([self._touched()]),
         )
 

@@ -93,6 +93,16 @@ class Conductor:
 
     # --- firmware_sim.pacing.Pacing
 
+    @property
+    def quiet_until_us(self) -> float:
+        """When the companion has its next turn, or MAVSDK repeats the setpoint [µs]."""
+        if self._suspended or self._asked is not None:
+            return 0.0
+        if (interrupt := self._turn.interrupt) is not None and interrupt.is_set():
+            return 0.0
+        due = (self._turn.wake_us, self._inbound.next_repeat_us)
+        return min((time_us for time_us in due if time_us is not None), default=0.0)
+
     def restart(self, tick_us: int) -> None:
         """Set the clock to `tick_us`."""
         self.clock.sleep_until(tick_us)

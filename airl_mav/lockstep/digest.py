@@ -37,6 +37,10 @@ class FlightDigest:
         """Add what happened in one of the `LANES` at a simulated time [µs]."""
         self._lanes[lane].update(_TIME.pack(time_us) + data)
 
+    def extend(self, lane: str, data: bytes) -> None:
+        """Add rows that have their times in them to one of the `LANES`."""
+        self._lanes[lane].update(data)
+
     def add_setpoints(self, columns: Mapping[str, NDArray[Any]]) -> None:
         """Add all setpoints of the flight, by column; call once, at its end."""
         for name, values in columns.items():
@@ -55,6 +59,9 @@ class Unwitnessed(FlightDigest):
     """Of a flight that nobody takes the fingerprint of: real firmware's is never the same."""
 
     def add(self, lane: str, time_us: int, data: bytes) -> None:
+        """Pass it over."""
+
+    def extend(self, lane: str, data: bytes) -> None:
         """Pass it over."""
 
 

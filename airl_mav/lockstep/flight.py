@@ -226,7 +226,7 @@ class Flight:
             self._abandon = self._stage.abandon
             if self._called_off:
                 self._abandon.set()
-            self._stage.firmware.on_tick = self._look
+            self._stage.firmware.on_ticks = self._look
             self._stage.firmware.on_message = self._hear
             if self._watched is not None:
                 self._stage.firmware.on_frame = self._watched.frame
@@ -285,13 +285,13 @@ class Flight:
     # --- the conductor's thread
 
     def _look(self, simulation: Simulation) -> None:
-        """Take the true state after a tick."""
+        """Take the true states of the newest ticks."""
         self._judge.look(simulation)
         self._ticked(simulation, self._supervisor.referee, self._judge.hit)
         if self._watched is not None:
             self._watched.tick(simulation, self._judge.hit)
-        self._ticks += 1
-        if self._ticks % SHOW_EVERY == 0:
+        shown, self._ticks = self._ticks // SHOW_EVERY, self._ticks + len(simulation.truths)
+        if self._ticks // SHOW_EVERY > shown:
             self._observer.state(state_of(simulation, self._judge.hit), simulation.start_us)
 
     def _order(self, order: Order) -> None:

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from airl_mav.flight.judge import TruthSample, Verdict
+import numpy as np
+
+from airl_mav.core.constants import US_PER_S
+from airl_mav.flight.judge import Referee, TruthSample, Verdict
 from airl_mav.lockstep.digest import FlightDigest
 from airl_mav.rehearsal.supervisor import Order, Supervisor
 from firmware_sim.crash_detector import CrashDetector
+from firmware_sim.engine.record import Record
 from firmware_sim.simulation import Simulation
 
 
@@ -52,16 +56,17 @@ class Judge:
             referee.start_navigation(time_us)
 
     def look(self, simulation: Simulation) -> None:
-        """Take the true state after a tick."""
-        plant = simulation.plant
+        """Take the true states of the newest ticks."""
         self._crash.look(simulation)
-        self._digest.add("trajectory", simulation.time_us, plant.motion.tobytes())
-        supervisor = self._supervisor
-        if supervisor is None:
-            return
-        sample = TruthSample(
-            simulation.time_us, plant.position, self._crash.hit, plant.battery_remaining
-        )
+        truths, supervisor = simulation.truths, self._supervisor
+        self._digest.extend("trajectory", truths.tobytes())
+        if supervisor is not None:
+            # Ticks before the last one matter only where one of them may decide the flight.
+            first = 0 if self._may_decide(supervisor.referee, truths) else -1
+            for time_us, motion, _, charge in truths[first:].tolist():
+                self._see(supervisor, TruthSample(time_us, motion[:3], self._crash.hit, charge))
+
+    def _see(self, supervisor: Supervisor, sample: TruthSample) -> None:
         before = supervisor.verdict
         order = supervisor.see(sample)
         if before is None and supervisor.verdict is not None:
@@ -69,3 +74,18 @@ class Judge:
             self._judged(supervisor.verdict)
         if order is not None:
             self._order(order)
+
+    def _may_decide(self, referee: Referee, truths: Record) -> bool:
+        """Return whether the flight may end before the last of some ticks (n,)."""
+        if referee.verdict is not None or len(truths) < 2:
+            return False
+        last, task, began_us = truths[-1], referee.task, referee.navigation_us
+        if self._crash.hit is not None or last["charge"] <= 0.0:
+            return True
+        if began_us is None:
+            return False
+        if last["time_us"] - began_us >= task.time_limit_s * US_PER_S:
+            return True
+        # Seen from above: of a goal with a height the vehicle is no nearer than that.
+        away = truths["motion"][:, :2] - task.goal[:2]
+        return bool((np.hypot(away[:, 0], away[:, 1]) < task.goal_radius_m).any())

@@ -104,7 +104,7 @@ class RemoteStage:
             self._judge = Judge(
                 supervisor, self._digest, order=self._partner.order, judged=self._decide
             )
-        self.firmware.on_tick = self._judge.look
+        self.firmware.on_ticks = self._judge.look
         self._conductor.begin(loaded.time_us + COMPANION_STARTS_US)
         return loaded
 

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from airl_mav.control.controller import Controller
 from airl_mav.control.demand import AnyDemand, AttitudeDemand, RateDemand
 from airl_mav.control.gains import Gains
 from airl_mav.control.mixer import Motors
-from airl_mav.core.constants import TICK_HZ, TICK_S
+from airl_mav.core.constants import TICK_HZ
 from airl_mav.core.frames import Geodetic
 from firmware_sim.autopilot.auto_disarm import AutoDisarm
 from firmware_sim.autopilot.autopilot_state import (
@@ -57,6 +56,9 @@ from firmware_sim.autopilot.requests import (
     Request,
 )
 from firmware_sim.autopilot.snapshot import Parts, Snapshot
+from firmware_sim.engine.controller import Controller
+from firmware_sim.engine.record import LANDING, LIFT_OFF, NOTHING
+from firmware_sim.engine.ticks import REPEATED_BITS, control_record
 from firmware_sim.interfaces import (
     ActuatorControls,
     DistanceReading,
@@ -66,7 +68,9 @@ from firmware_sim.interfaces import (
     Truth,
 )
 
-_STILL: Motors = (0.0, 0.0, 0.0, 0.0)
+DECIDE_US = 20_000
+"""Time between two decisions of a mode whose demand changes in flight: PX4's flight modes run at 50
+Hz (FlightModeManager) [µs]."""
 
 CLIENTS_SENSOR = 1
 """Source of ranges: not the vehicle's own sensor."""
@@ -89,6 +93,8 @@ class BuiltinAutopilot:
         value = parameters.value
         self.estimator = Estimator(value, new_filter)
         """For consistency checks."""
+        self.record = record = self.estimator.record
+        """Samples, estimate, control loops."""
         self._state = self.estimator.state
         self._guidance = Guidance(value, self._say)
         self._navigator = Navigator(self.plans, value, self)
@@ -98,14 +104,21 @@ class BuiltinAutopilot:
         self.supervisor = Supervisor(value, self.estimator, self._events.append)
         """Failsafes and pre-arm checks."""
         self._auto_disarm = AutoDisarm(value)
-        self._land_detector = LandDetector(value)
-        self._controller = Controller(Gains.from_parameters(value), TICK_S)
+        self._land_detector = LandDetector(value, record)
+        self._controller = Controller(Gains.from_parameters(value), record)
         parameters.on_change(self._parameters_changed)
         self._messages: list[Message] = []
         self._demand: AnyDemand | None = None
         """What is being flown; None = the motors are stopped."""
-        self._motors = _STILL
-        self._newest = NewestSensors()
+        self._taken_us = -1
+        """Time of the newest sample that the estimator has taken [µs]."""
+        self._due_us = 0
+        """When to decide again [µs]."""
+        self._decided_on: tuple[Flight | None, object] = (None, None)
+        """The commander's state and the setpoint that the newest decision is of."""
+        self._decided_healthy = False
+        """Whether the estimator was healthy then."""
+        self._newest = NewestSensors(record)
         self._home = Home(self.estimator, self._guidance)
         self._whereabouts = Whereabouts(self.estimator, self._newest, self._home, value)
         self._commander = FlightCommander(
@@ -143,16 +156,39 @@ class BuiltinAutopilot:
 
     def step(self, sample: SensorSample) -> ActuatorControls:
         """Take one tick's sensors and return the motor commands until the next."""
-        time_us, supervisor, sensors = sample.time_us, self.supervisor, self.supervisor.sensors
+        self.take(sample)
+        self.decide_if_due()
+        if self._demand is not None:
+            control_record(self.record)
+        self._detect_ground(sample.time_us)
+        return ActuatorControls(sample.time_us, self._motors, self.flight.phase >= _GROUND)
+
+    def take(self, sample: SensorSample) -> None:
+        """Take one tick's sensors into the estimate; harmless when called again."""
+        if sample.time_us == self._taken_us:
+            return
+        sensors = self.supervisor.sensors
         sensors.take(sample)
         self.estimator.step(sensors.trusted(sample) if sensors.distrusted else sample)
-        self._snapshot = None
-        self._newest.take(sample)
+        self._heard(sample)
         finder = self.estimator.range
         if finder is not None:
             self._guidance.context.ground = self._land_detector.ground = finder.clearance()
         if sample.esc_outputs is not None:
-            supervisor.watch.hear_escs(time_us, self._motors, sample.esc_outputs)
+            self.supervisor.watch.hear_escs(sample.time_us, self._motors, sample.esc_outputs)
+
+    def _heard(self, sample: SensorSample) -> None:
+        self._taken_us, self._snapshot = sample.time_us, None
+        self._newest.take(sample)
+
+    def decide(self) -> None:
+        """Decide what is flown: commander, failsafes, navigator, modes."""
+        sample, supervisor = self._newest.sample, self.supervisor
+        if sample is None:
+            return
+        time_us = sample.time_us
+        if self.flight.phase is _AIR and self._guidance.is_done(self._state):
+            self._commander.handle(Event.MODE_DONE)
         if self._home.place is None and self.estimator.origin is not None:
             if self.flight.phase < _GROUND:
                 self._home.set_here()
@@ -161,10 +197,9 @@ class BuiltinAutopilot:
         readiness = READINESS[self.flight.phase][self.estimator.healthy]
         if readiness is not None:
             self._commander.handle(readiness)
-        idle = self._demand is None
         if time_us >= supervisor.next_us:
             self._commander.look()
-        due = self._auto_disarm.event(self.flight, time_us, idle=idle)
+        due = self._auto_disarm.event(self.flight, time_us, idle=self._demand is None)
         if due is not None:
             self._commander.handle(due)
         if time_us >= self._navigator.due_us:
@@ -172,13 +207,68 @@ class BuiltinAutopilot:
         if self._manual_control.was_heard:
             self._guidance.context.sticks = self._manual_control.sticks(time_us)
         self._demand = self._guidance.demand(self._state, self.flight.phase, time_us)
-        if self._demand is not None:
-            self._motors = self._controller.fly(self._state, self._demand)
-        elif not idle:
-            self._motors = _STILL
-            self._controller.rest()
-        self._detect_ground(time_us)
-        return ActuatorControls(time_us, self._motors, self.flight.phase >= _GROUND)
+        self._controller.command(self._demand)
+
+    # --- compiled ticks
+
+    @property
+    def compiled(self) -> bool:
+        """Whether compiled ticks estimate and control as `step` does."""
+        return self.estimator.compiled
+
+    def decide_if_due(self) -> int:
+        """Decide where something is due or has arrived; return when to ask again [µs]."""
+        flight, setpoint = self._decided_on
+        if (
+            self._taken_us >= self._due_us
+            or flight is not self.flight
+            or self._decided_healthy is not self.estimator.healthy
+            or setpoint is not self._guidance.context.setpoint
+            or self._taken_us >= min(self.supervisor.next_us, self._navigator.due_us)
+        ):
+            self.decide()
+            self._prepare()
+        return self._due_us
+
+    def _prepare(self) -> None:
+        """Prepare the record for compiled ticks, and say when to decide again."""
+        self.estimator.prepare()
+        self._decided_on = flight, _ = self.flight, self._guidance.context.setpoint
+        self._decided_healthy = self.estimator.healthy
+        phase = flight.phase
+        self.record["detecting"] = (
+            LANDING if phase is _AIR else LIFT_OFF if phase is _GROUND else NOTHING
+        )
+        self._due_us = min(self.supervisor.next_us, self._navigator.due_us)
+        if not self._guidance.is_steady(phase) or self._manual_control.was_heard:
+            self._due_us = min(self._due_us, self._taken_us + DECIDE_US)
+
+    def fuse(self, sample: SensorSample, left: int) -> bool:
+        """Fuse what a compiled tick leaves to Python; return whether the health has changed.
+
+        Args:
+            sample: Of the tick.
+            left: What is left of it, as `engine.ticks.estimate` returns it.
+        """
+        sensors = self.supervisor.sensors
+        sensors.repeated(sample.time_us, left, left >> REPEATED_BITS)
+        return self.estimator.fuse_rest(sensors.trusted(sample) if sensors.distrusted else sample)
+
+    def flown(self, sample: SensorSample) -> bool:
+        """Take note of compiled ticks; return whether the commander's state has changed by them.
+
+        The sample is the newest, which the estimator has taken.
+        """
+        before = self.flight
+        self.estimator.flown()
+        self._heard(sample)
+        if self.record["detected"][0]:
+            self._commander.handle(Event.LANDED if self.flight.phase is _AIR else Event.LIFTED)
+        return self.flight is not before
+
+    @property
+    def _motors(self) -> Motors:
+        return self._controller.motors
 
     def _navigate(self) -> None:
         situation, flight = self._situation(), self.flight
@@ -207,8 +297,6 @@ class BuiltinAutopilot:
                 self._state, time_us, control.thrust, descending=control.descending
             ):
                 self._commander.handle(Event.LANDED)
-            elif self._guidance.is_done(self._state):
-                self._commander.handle(Event.MODE_DONE)
         elif phase is _GROUND and self._land_detector.lifted(self._state, self._controller.thrust):
             self._commander.handle(Event.LIFTED)
 
@@ -230,6 +318,8 @@ class BuiltinAutopilot:
 
     def _parameters_changed(self) -> None:
         self._controller.set_gains(Gains.from_parameters(self.parameters.value))
+        self._land_detector.read_parameters()
+        self.estimator.is_changed = True
         self.supervisor.read_parameters()
         self._say_all(self.parameters.take_texts())
 

@@ -15,13 +15,13 @@ resets the variance of the gyro's bias, and gives up a compass (`mag_fault`).
 from __future__ import annotations
 
 import math
-from collections import deque
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S
 from airl_mav.core.frames import Vector
+from airl_mav.core.kernels import kernel
 
 FAR = 3.0
 """An innovation beyond this many standard deviations is one of a run."""
@@ -37,7 +37,7 @@ LATE_S = 0.5
 """A receiver may be so much later than stated: a velocity that differs by no more than what the
 vehicle has changed its own in that time says nothing of the inertial sensors [s]."""
 
-_LOOK_BACK = 6
+LOOK_BACK = 6
 """Samples over which the greatest acceleration is looked for."""
 
 REFUSED_US = US_PER_S
@@ -142,6 +142,11 @@ class Compass:
         self._refused_us: int | None = None
         self._gate_rad = 0.0
 
+    @property
+    def is_suspect(self) -> bool:
+        """Whether headings are refused, or were lately."""
+        return self.given_up or self._failed or self._refused_us is not None
+
     def admits(self, innovation_rad: float) -> bool:
         """Return whether a heading may be fused, if it passes the gate too."""
         near = not self.given_up or abs(innovation_rad) <= self._gate_rad
@@ -161,25 +166,64 @@ class Compass:
             self.given_up = True
 
 
+@kernel
+def note_velocity(record: Any, deviations: Vector, acceleration: Vector) -> None:
+    """Note a velocity in the record of a flight controller: its noise, the vehicle's acceleration.
+
+    Args:
+        record: Updated.
+        deviations: Innovation in standard deviations (3,).
+        acceleration: As estimated (3,) NED [m/s²].
+    """
+    square, slot = 0.0, record.fixes % LOOK_BACK
+    for i in range(3):
+        square += (deviations[i] - record.velocity_before[i]) ** 2
+        record.velocity_before[i] = deviations[i]
+        record.accelerations[slot, i] = abs(acceleration[i])
+    record.fixes += 1
+    if not math.isnan(square):
+        # Two independent samples differ by twice the variance of one.
+        variance = min(square / 6.0, _OUTLIER)
+        record.velocity_noise += _NOISE_SHARE * (variance - record.velocity_noise)
+
+
+@kernel
+def _note_velocity(records: Any, deviations: Vector, acceleration: Vector) -> None:
+    note_velocity(records[0], deviations, acceleration)
+
+
 class Consistency:
     """Watches the innovations of velocity and heading."""
 
-    def __init__(self) -> None:
+    def __init__(self, record: Any = None) -> None:
+        """Begin in the record of a flight controller; None = in a new one."""
+        if record is None:
+            from firmware_sim.engine.record import new_controller
+
+            record = new_controller()
+        self._record = record
         self.restarts = 0
         """How often the filter has been restarted."""
         self.restarted_us: int | None = None
         """When that was last."""
-        self._variance = 1.0
-        """Of the velocity's noise, as a share of what it should be."""
         self._runs = [Run(VELOCITY_RUN) for _ in range(3)]
-        self._before: Vector | None = None
-        self._accelerations: deque[Vector] = deque(maxlen=_LOOK_BACK)
         self._heading = Run(HEADING_RUN)
+
+    @property
+    def velocity_deviates(self) -> bool:
+        """Whether the newest velocities were far off on one side, or noisy."""
+        return any(run.length for run in self._runs) or self.velocity_excess > 1.0
+
+    @property
+    def heading_deviates(self) -> bool:
+        """Whether the newest headings were far off on one side."""
+        return self._heading.length > 0
 
     @property
     def velocity_excess(self) -> float:
         """By how much the variance of the velocity exceeds what it should be; 1 = it does not."""
-        return self._variance if self._variance > NOISY else 1.0
+        noise: float = self._record["velocity_noise"].item(0)
+        return noise if noise > NOISY else 1.0
 
     def velocity(
         self, innovation: Vector, sigma: Vector, acceleration: Vector, time_us: int
@@ -198,15 +242,10 @@ class Consistency:
         deviations = innovation / sigma
         if not np.isfinite(deviations).all():
             return None
-        excess = self.velocity_excess
-        if self._before is not None:
-            change = deviations - self._before
-            # Two independent samples differ by twice the variance of one.
-            variance = min(float(change @ change) / 6.0, _OUTLIER)
-            self._variance += _NOISE_SHARE * (variance - self._variance)
-        self._before = deviations
-        self._accelerations.append(np.abs(acceleration))
-        late = LATE_S * np.max(self._accelerations, axis=0)
+        excess, record = self.velocity_excess, self._record
+        _note_velocity(record, deviations, acceleration)
+        seen = min(record["fixes"].item(0), LOOK_BACK)
+        late = LATE_S * np.max(record["accelerations"][0, :seen], axis=0)
         unexplained = np.sign(innovation) * np.maximum(np.abs(innovation) - late, 0.0)
         deviations = unexplained / (sigma * math.sqrt(excess))
         lasted = [
@@ -235,5 +274,5 @@ class Consistency:
     def _anew(self, restart: Restart) -> Restart:
         for run in (*self._runs, self._heading):
             run.restart()
-        self._before = None
+        self._record["velocity_before"] = np.nan
         return restart

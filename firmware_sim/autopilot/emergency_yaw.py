@@ -54,6 +54,10 @@ class EmergencyYaw:
         apart = off > max(FAILED_RAD, SUSPECTED_SIGMA * math.sqrt(yaw.variance))
         return apart and yaw.explained(heading) > EXPLAINED
 
+    def is_doubted(self, time_us: int) -> bool:
+        """Return whether something was found to be wrong lately."""
+        return self._doubted_us is not None and time_us - self._doubted_us <= DOUBTED_US
+
     def doubt(self, time_us: int) -> None:
         """Note that something must be wrong, and that the heading may be."""
         self._doubted_us = time_us
@@ -67,7 +71,7 @@ class EmergencyYaw:
             fused_us: When a GPS velocity was last within the gate; None = never.
         """
         refused = fused_us is not None and time_us - fused_us >= REFUSED_US
-        doubted = self._doubted_us is not None and time_us - self._doubted_us <= DOUBTED_US
+        doubted = self.is_doubted(time_us)
         sigma = math.sqrt(yaw.variance)
         return (refused and sigma < CONVERGED_RAD) or (doubted and sigma < SURE_RAD)
 

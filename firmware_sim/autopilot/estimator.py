@@ -19,7 +19,7 @@ from airl_mav.core.frames import (
     geodetic_to_local,
     local_to_geodetic,
 )
-from airl_mav.core.location import MAGNETIC_DECLINATION, MAGNETIC_FIELD_NED
+from airl_mav.core.location import MAGNETIC_DECLINATION
 from airl_mav.vehicle.atmosphere import altitude_m
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.alignment import Alignment
@@ -35,19 +35,20 @@ from firmware_sim.autopilot.range_finder import Aids, RangeFinder
 from firmware_sim.autopilot.recovery import Moment, Recovery
 from firmware_sim.autopilot.terrain_filter import TerrainFilter
 from firmware_sim.autopilot.yaw_estimator import YawEstimator
+from firmware_sim.engine.record import (
+    OFF,
+    SUSPECT,
+    TRUSTED,
+    Record,
+    new_controller,
+)
+from firmware_sim.engine.ticks import HEADING_BY_TURN_NED, settle_record
 from firmware_sim.interfaces import (
     DistanceReading,
     FlowReading,
     GpsFix,
     Odometry,
     SensorSample,
-)
-
-_north, _east, _down = MAGNETIC_FIELD_NED
-# The field dips, so a tilt error turns the measured heading: seen from the world's axes,
-# d innovation / d phi = (-tan(dip) cos(declination), -tan(dip) sin(declination), 1).
-_HEADING_BY_TURN_NED = np.array([-_down * _north, -_down * _east, _north**2 + _east**2]) / (
-    _north**2 + _east**2
 )
 
 _NO_COMPASS = 5
@@ -77,22 +78,37 @@ _SIGMA, _INNOVATION_RATIO = slice(es.SIGMA, es.RATIO), slice(es.RATIO, None)
 class Estimator:
     """Turns noisy sensors into position, velocity, attitude and biases; never sees the truth."""
 
-    def __init__(self, value: Callable[[str], float], new_filter: NewFilter = KernelFilter) -> None:
-        """Start unaligned; `value` looks up EKF2_* parameters by name."""
+    def __init__(
+        self,
+        value: Callable[[str], float],
+        new_filter: NewFilter = KernelFilter,
+        record: Record | None = None,
+    ) -> None:
+        """Start unaligned.
+
+        Args:
+            value: Looks up EKF2_* parameters by name.
+            new_filter: Makes what carries the error's covariance.
+            record: Of the flight controller, whose state and covariance are used; None = a new one.
+        """
+        self.record = record = new_controller() if record is None else record
+        """Of the flight controller."""
         self._value = value
         self.origin: Geodetic | None = None
         """Where local NED is zero: the mean of the first fixes, or what somebody has said; None
         while neither is known."""
-        self.state = es.new_state()
+        self.state: Vector = record["state"][0]
         """The nominal state, by `error_state`'s layout."""
-        self.healthy = False
-        """Converged: may be armed and flown on."""
+        self.state[:] = es.new_state()
         self.filter = new_filter(np.diag(es.INITIAL_SIGMA**2), self._process_noise())
         """Carries the error's covariance."""
+        if isinstance(self.filter, KernelFilter):
+            self.filter.keep_in(
+                record["covariance"][0], record["transition"][0], record["process_noise"][0]
+            )
         self.innovations: Callable[[str, Vector, Vector], None] | None = None
         """Called with name, innovation and its covariance for every measurement, if set."""
         self._alignment = Alignment(value)
-        self._origin_altitude_baro = 0.0
         self._judged_us = 0
         """When a velocity of external vision was last held against the inertial sensors."""
         self._chosen_origin: Geodetic | None = None
@@ -103,21 +119,27 @@ class Estimator:
         """When it was aligned where GPS had said that it is; None: not yet, or without GPS."""
         self._estimate: Estimate | None = None
         horizontal = selecting(es.POS, es.POS + 1, es.VEL, es.VEL + 1)
-        self._gps_horizontal = Measurement("gps_horizontal", 0, horizontal)
-        self._gps_vertical = Measurement("gps_vertical", 3, selecting(es.POS + 2, es.VEL + 2))
+        record["gps_horizontal_h"] = horizontal
+        record["gps_vertical_h"] = selecting(es.POS + 2, es.VEL + 2)
+        self._gps_horizontal = Measurement(
+            "gps_horizontal", 0, record["gps_horizontal_h"][0], record["gps_horizontal_us"]
+        )
+        self._gps_vertical = Measurement(
+            "gps_vertical", 3, record["gps_vertical_h"][0], record["gps_vertical_us"]
+        )
         self._gps_sinking = Measurement("gps_down_velocity", 3, selecting(es.VEL + 2))
-        self._baro = Measurement("baro", 1, selecting(es.BARO) - selecting(es.POS + 2))
-        self._heading = Measurement("heading", 2, np.zeros((1, es.N_STATES)))
+        record["baro_h"] = selecting(es.BARO) - selecting(es.POS + 2)
+        self._baro = Measurement("baro", 1, record["baro_h"][0], record["baro_fused_us"])
+        heading_h, heading_us = record["heading_h"][0], record["heading_fused_us"]
+        self._heading = Measurement("heading", 2, heading_h, heading_us)
         self._horizon = FusionHorizon()
-        self.yaw = YawEstimator()
+        self.yaw = YawEstimator(record)
         """The heading without a compass."""
-        self.recovery = Recovery(self.state, self.filter, self.yaw)
+        self.recovery = Recovery(self.state, self.filter, self.yaw, record)
         """What is done about inertial sensors and a heading that have gone wrong."""
         self.vision = ExternalVision(value, self.state, self.filter, self._fuse, self._judge)
         """What something else has estimated of the vehicle's pose."""
         self._horizons = [self._horizon, self.vision.horizon]
-        self.flying = False
-        """Whether the vehicle is in the air; set by whoever knows."""
         self.odometry: Odometry | None = None
         """The newest pose that something else has estimated; None before any."""
         self.odometry_us = 0
@@ -126,24 +148,48 @@ class Estimator:
         """What tells how far the ground is below; None before the first range, or flow."""
         self.flow: OpticalFlow | None = None
         """What tells how the ground moves below; None before the first flow."""
+        self.is_changed = True
+        """Whether Python has changed what compiled ticks need to know: `prepare` them."""
         self._field: Vector | None = None
         """The newest that the compass has measured (3,) FRD [gauss]; before alignment the mean."""
 
+    @property
+    def healthy(self) -> bool:
+        """Converged: may be armed and flown on."""
+        return bool(self.record["healthy"].item(0))
+
+    @healthy.setter
+    def healthy(self, healthy: bool) -> None:
+        self.record["healthy"] = healthy
+
+    @property
+    def flying(self) -> bool:
+        """Whether the vehicle is in the air; set by whoever knows."""
+        return bool(self.record["flying"].item(0))
+
+    @flying.setter
+    def flying(self, flying: bool) -> None:
+        self.record["flying"] = flying
+
+    @property
+    def _origin_altitude_baro(self) -> float:
+        """Altitude of local NED's origin by the barometer [m]."""
+        return self.record["baro_origin_m"].item(0)
+
+    @_origin_altitude_baro.setter
+    def _origin_altitude_baro(self, altitude: float) -> None:
+        self.record["baro_origin_m"] = altitude
+
     def step(self, sample: SensorSample) -> None:
         """Take one tick's sensors."""
-        self._time_us, self._estimate = sample.time_us, None
+        self._time_us, self._estimate, self.is_changed = sample.time_us, None, True
+        self._note(sample)
         if self._aligned_us is None:
             self._align(sample)
         else:
             self._predict(sample)
             self.yaw.feel(sample.gyro, sample.accel)
-            if sample.gps is not None and self._uses_gps:
-                self._fuse_gps(sample.gps)
-            if sample.pressure_hpa is not None:
-                self._fuse_baro(sample.pressure_hpa)
-            if sample.mag is not None:
-                self._field = sample.mag
-                self._fuse_heading(sample.mag)
+            self._fuse_slower(sample)
             if sample.odometry is not None:
                 self.see(sample.odometry)
             elif self.vision.fused:
@@ -158,8 +204,87 @@ class Estimator:
                 self.look_down(sample.flow)
             if self.flow is not None:
                 self.flow.step(sample.time_us, aided=self._aided, flying=self.flying)
+        self._settle()
+
+    def _note(self, sample: SensorSample) -> None:
+        record = self.record
+        record["time_us"], record["accel"], record["gyro"] = (
+            sample.time_us,
+            sample.accel,
+            sample.gyro,
+        )
+        record["temperature_c"] = sample.temperature_c
+        if sample.mag is not None:
+            record["mag"] = sample.mag
+        if sample.pressure_hpa is not None:
+            record["pressure_hpa"] = sample.pressure_hpa
+
+    def _fuse_slower(self, sample: SensorSample) -> None:
+        """Fuse what GPS, barometer and compass have measured."""
+        if sample.gps is not None and self._uses_gps:
+            self._fuse_gps(sample.gps)
+        if sample.pressure_hpa is not None:
+            self._fuse_baro(sample.pressure_hpa)
+        if sample.mag is not None:
+            self._field = sample.mag
+            self._fuse_heading(sample.mag)
+
+    def _settle(self) -> None:
         converged = es.converged(self.state, self.filter.covariance)
         self.healthy = converged and self._aligned_us is not None
+
+    # --- compiled ticks
+
+    @property
+    def compiled(self) -> bool:
+        """Whether compiled ticks estimate as `step` does: no aid besides GPS is in use."""
+        return (
+            self._aligned_us is not None
+            and self.range is None
+            and self.flow is None
+            and not self.vision.fused
+            and self.innovations is None
+            and not self._horizon.is_past
+            and isinstance(self.filter, KernelFilter)
+        )
+
+    def prepare(self) -> None:
+        """Tell the record what the parameters, and what was measured so far, ask of the filter.
+
+        That is what Python has changed since the last call.
+        """
+        if not self.is_changed:
+            return
+        self.is_changed = False
+        record, value = self.record, self._value
+        record["baro_variance"] = value("EKF2_BARO_NOISE") ** 2
+        record["heading_variance"] = value("EKF2_HEAD_NOISE") ** 2
+        record["gps_variance"] = value("EKF2_GPS_P_NOISE") ** 2, value("EKF2_GPS_V_NOISE") ** 2
+        record["origin"] = self.origin or (math.nan,) * 3
+        self._horizon.assume(value("EKF2_GPS_DELAY"))
+        self._suspect()
+
+    def _suspect(self) -> None:
+        """Tell the record which sensors have to be judged sample by sample."""
+        recovery = self.recovery
+        headed, moving = recovery.consistency.heading_deviates, recovery.consistency
+        suspect = recovery.compass.is_suspect or headed
+        used = self._value("EKF2_MAG_TYPE") != _NO_COMPASS
+        self.record["compass"] = OFF if not used else SUSPECT if suspect else TRUSTED
+        suspect = moving.velocity_deviates or recovery.emergency.is_doubted(self._time_us)
+        self.record["gps"] = OFF if not self._uses_gps else SUSPECT if suspect else TRUSTED
+
+    def fuse_rest(self, sample: SensorSample) -> bool:
+        """Fuse what a compiled tick leaves to Python; return whether the health has changed."""
+        self._time_us, self._estimate = sample.time_us, None
+        self._fuse_slower(sample)
+        self._suspect()
+        return bool(settle_record(self.record))
+
+    def flown(self) -> None:
+        """Take note that compiled ticks have moved the estimate."""
+        self._time_us, self._estimate = self.record["time_us"].item(0), None
+        self._field = self.record["mag"][0]
 
     def see(self, odometry: Odometry) -> None:
         """Take what something else has estimated, now."""
@@ -219,7 +344,7 @@ class Estimator:
 
         Source: PX4 1.16, Ekf::setEkfGlobalOrigin.
         """
-        before, self._chosen_origin = self.origin, origin
+        before, self._chosen_origin, self.is_changed = self.origin, origin, True
         if before is None:
             if self._aligned_us is not None:
                 # Local NED goes on, and is now known to lie there.
@@ -425,7 +550,7 @@ class Estimator:
             return
         m = self._heading
         observable = es.observe_heading(
-            self.state, field, MAGNETIC_DECLINATION, _HEADING_BY_TURN_NED, m.innovation, m.h
+            self.state, field, MAGNETIC_DECLINATION, HEADING_BY_TURN_NED, m.innovation, m.h
         )
         innovation = m.innovation.item(0)
         if not (observable and self.recovery.compass.admits(innovation)):

@@ -49,7 +49,7 @@ def _times_transposed(f: Vector, p: Vector, columns: int, out: Vector) -> None:
 
 
 @kernel
-def _predict(
+def predict(
     state: Vector, p: Vector, noise: Vector, f: Vector, gyro: Vector, accel: Vector, dt: float
 ) -> None:
     """Move the nominal state and its covariance, p = f p f' + noise, in place."""
@@ -68,32 +68,32 @@ def _predict(
 
 
 @kernel
-def _fuse(state: Vector, p: Vector, innovation: Vector, h: Vector, variance: Vector) -> float:
+def fuse(state: Vector, p: Vector, innovation: Vector, h: Vector, variance: Vector) -> float:
     """Correct the nominal state and its covariance in place; return the gate's ratio."""
     m = len(innovation)
-    spread = np.empty(N_STATES)
+    column = np.empty(N_STATES)
     total = np.empty(m)
     for k in range(m):
-        total[k] = _spread(p, h[k], spread) + variance[k]
+        total[k] = spread(p, h[k], column) + variance[k]
     ratio = gate_ratio(innovation, total)
     if not ratio <= 1.0:
         return ratio
     error = np.zeros(N_STATES)
     for k in range(m):
-        weight = 1.0 / (_spread(p, h[k], spread) + variance[k])
+        weight = 1.0 / (spread(p, h[k], column) + variance[k])
         rest = innovation[k]
         for i in range(N_STATES):
             rest -= h[k, i] * error[i]
         for i in range(N_STATES):
-            error[i] += spread[i] * rest * weight
+            error[i] += column[i] * rest * weight
             for j in range(N_STATES):
-                p[i, j] -= spread[i] * spread[j] * weight
+                p[i, j] -= column[i] * column[j] * weight
     inject(state, error)
     return ratio
 
 
 @kernel
-def _spread(p: Vector, row: Vector, out: Vector) -> float:
+def spread(p: Vector, row: Vector, out: Vector) -> float:
     """Write p row' (16,); return row p row'. Skips the many zeros of the row."""
     out[:] = 0.0
     for k in range(N_STATES):
@@ -115,15 +115,20 @@ class KernelFilter:
         self._noise = noise.copy()
         self._transition = np.eye(N_STATES)
 
+    def keep_in(self, covariance: Vector, transition: Vector, noise: Vector) -> None:
+        """Keep covariance and transition (16, 16) and noise (16,) in these arrays from now on."""
+        covariance[:], transition[:], noise[:] = self.covariance, self._transition, self._noise
+        self.covariance, self._transition, self._noise = covariance, transition, noise
+
     def predict(self, state: Vector, gyro: Vector, accel: Vector) -> None:
         """Move the nominal state, updated in place, and the covariance by one tick."""
-        _predict(state, self.covariance, self._noise, self._transition, gyro, accel, TICK_S)
+        predict(state, self.covariance, self._noise, self._transition, gyro, accel, TICK_S)
 
     def restart(self, covariance: Vector) -> None:
         """Go on from another covariance (16, 16)."""
-        self.covariance = covariance.copy()
+        self.covariance[:] = covariance
 
     def fuse(self, state: Vector, innovation: Vector, h: Vector, variance: Vector) -> float:
         """Correct the nominal state by one measurement, unless it fails the gate."""
-        ratio: float = _fuse(state, self.covariance, innovation, h, variance)
+        ratio: float = fuse(state, self.covariance, innovation, h, variance)
         return ratio

@@ -103,6 +103,12 @@ class Guidance:
         self._spool_since_us = None
         return None
 
+    def is_steady(self, phase: Phase) -> bool:
+        """Return whether the demand stays the same until something is asked for or decided."""
+        if self._stopped or phase < _GROUND:
+            return True
+        return phase is _AIR and self._flown.is_steady
+
     def _ramped(self, demand: AnyDemand, time_us: int) -> AnyDemand:
         """Return a demand for a vehicle on the ground, its climb rate limited by the take-off ramp.
 

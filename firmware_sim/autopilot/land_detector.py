@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
+
+import numpy as np
 
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Vector
+from airl_mav.core.kernels import kernel
 from firmware_sim.autopilot.autopilot_state import Clearance
 from firmware_sim.autopilot.error_state import V
 
@@ -25,13 +29,67 @@ NEAR_GROUND_M = 1.0
 UNSURE = 3.0
 
 
+# Layout of the thresholds.
+_TRIGGER_US, _CARRIED_THRUST, _SLOW_DOWN, _SLOW, _LIFT_THRUST, _LIFTED_M_S = range(6)
+
+
+def thresholds(value: Callable[[str], float]) -> Vector:
+    """Return what the parameters say (6,).
+
+    LNDMC_TRIG_TIME [µs]; the thrust below which the floor must be carrying; vertical and horizontal
+    speed of a vehicle at rest [m/s]; thrust of one that flies; vertical speed of one that has left
+    the floor at any thrust [m/s].
+    """
+    low, hover, vertical = value("MPC_THR_MIN"), value("MPC_THR_HOVER"), value("LNDMC_Z_VEL_MAX")
+    return np.array(
+        [
+            value("LNDMC_TRIG_TIME") * US_PER_S,
+            low + LOW_THRUST * (hover - low),
+            vertical,
+            value("LNDMC_XY_VEL_MAX"),
+            LIFT_THRUST * hover,
+            LIFTED_SPEED * vertical,
+        ]
+    )
+
+
+@kernel
+def rests(state: Vector, thrust: float, land: Vector) -> bool:
+    """Return whether a vehicle at a collective 0..1 moves as one that the floor carries."""
+    slow = abs(state[V + 2]) < land[_SLOW_DOWN]
+    return bool(
+        thrust <= land[_CARRIED_THRUST]
+        and slow
+        and math.hypot(state[V], state[V + 1]) < land[_SLOW]
+    )
+
+
+@kernel
+def lifts_off(state: Vector, thrust: float, land: Vector) -> bool:
+    """Return whether a standing vehicle has left the floor.
+
+    MPC_THR_HOVER may be wrong: one that is lighter than it says climbs at less thrust.
+    """
+    climb_m_s = -state[V + 2]
+    hovers = climb_m_s > LIFT_SPEED_M_S and thrust > land[_LIFT_THRUST]
+    return bool(climb_m_s > land[_LIFTED_M_S] or hovers)
+
+
 class LandDetector:
     """Detects a landing after LNDMC_TRIG_TIME without motion at low thrust."""
 
-    def __init__(self, value: Callable[[str], float]) -> None:
-        """Take a lookup of PX4 parameter names."""
+    def __init__(self, value: Callable[[str], float], record: Any = None) -> None:
+        """Take a lookup of PX4 parameter names.
+
+        `record` is that of the flight controller; None = a new one.
+        """
+        if record is None:
+            from firmware_sim.engine.record import new_controller
+
+            record = new_controller()
         self._value = value
-        self._still_since_us: int | None = None
+        self._record = record
+        self.read_parameters()
         self.ground: Clearance | None = None
         """How far the ground is below; None = nothing tells it."""
         self._ground_seen = False
@@ -43,32 +101,23 @@ class LandDetector:
         `thrust` is the collective that is commanded, 0..1. `descending`: the setpoint asks to go
         down; a low-thrust moment in level flight is no landing.
         """
-        ground = self.ground
+        ground, record = self.ground, self._record
         if ground is not None and ground.by_range:
             self._ground_seen = True
-        if not (
-            descending and self._carried(thrust) and self._still(state) and self._is_near_ground()
-        ):
-            self._still_since_us = None
+        if not (descending and rests(state, thrust, self._land) and self._is_near_ground()):
+            record["still_since_us"] = -1
             return False
-        if self._still_since_us is None:
-            self._still_since_us = time_us
-        needed_s = self._value("LNDMC_TRIG_TIME")
+        if record["still_since_us"][0] < 0:
+            record["still_since_us"] = time_us
+        needed_us = self._land[_TRIGGER_US]
         if self._ground_seen and self.ground is not None and not self.ground.valid:
-            needed_s *= UNSURE
-        return time_us - self._still_since_us >= needed_s * US_PER_S
+            needed_us *= UNSURE
+        return bool(time_us - record["still_since_us"][0] >= needed_us)
 
     def lifted(self, state: Vector, thrust: float) -> bool:
-        """Return whether a standing vehicle has left the floor.
-
-        MPC_THR_HOVER may be wrong: one that is lighter than it says climbs at less thrust.
-        """
-        self._still_since_us = None
-        climb_m_s = -state.item(V + 2)
-        if climb_m_s > LIFTED_SPEED * self._value("LNDMC_Z_VEL_MAX"):
-            return True
-        hovers = thrust > LIFT_THRUST * self._value("MPC_THR_HOVER")
-        return climb_m_s > LIFT_SPEED_M_S and hovers
+        """Return whether a standing vehicle has left the floor."""
+        self._record["still_since_us"] = -1
+        return bool(lifts_off(state, thrust, self._land))
 
     def _is_near_ground(self) -> bool:
         """Return whether ranges allow that the vehicle stands; without any they do."""
@@ -77,11 +126,7 @@ class LandDetector:
             return True
         return not (self._ground_seen and ground.valid and ground.dist_bottom_m >= NEAR_GROUND_M)
 
-    def _carried(self, thrust: float) -> bool:
-        low = self._value("MPC_THR_MIN")
-        return thrust <= low + LOW_THRUST * (self._value("MPC_THR_HOVER") - low)
-
-    def _still(self, state: Vector) -> bool:
-        north, east, down = state[V : V + 3].tolist()
-        slow = abs(down) < self._value("LNDMC_Z_VEL_MAX")
-        return slow and math.hypot(north, east) < self._value("LNDMC_XY_VEL_MAX")
+    def read_parameters(self) -> None:
+        """Read the parameters anew."""
+        self._record["land"] = thresholds(self._value)
+        self._land = self._record["land"][0]

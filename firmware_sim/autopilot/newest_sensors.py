@@ -2,32 +2,49 @@
 
 from __future__ import annotations
 
-import math
-
-import numpy as np
-
+from airl_mav.core.frames import Vector, local_to_geodetic
+from airl_mav.core.location import HOME
+from firmware_sim.engine.record import GPS_ROW, SEEN, Record
 from firmware_sim.interfaces import GpsFix, SensorSample
 
 
 class NewestSensors:
-    """Keeps what came last."""
+    """Newest sample, GPS fix, and what the record of a flight controller has of the others."""
 
-    def __init__(self) -> None:
+    def __init__(self, record: Record) -> None:
+        """Begin without a sample."""
+        self._record = record
         self.sample: SensorSample | None = None
         """The newest tick's; None before the first."""
-        self.mag = np.zeros(3)
+        self._fix: GpsFix | None = None
+        self._fix_us = -1
+
+    @property
+    def gps(self) -> GpsFix | None:
+        """The newest fix; None before the first."""
+        seen_us = self._record["watch"].item(0, GPS_ROW, SEEN)
+        if self._fix is not None and seen_us > self._fix_us:
+            # Compiled ticks have taken it: accuracy and satellites stay what they are.
+            place, velocity = self._record["gps_position"][0], self._record["gps_velocity"][0]
+            self._fix_us = seen_us
+            self._fix = self._fix._replace(
+                position=local_to_geodetic(place, HOME), velocity_ned=velocity.copy()
+            )
+        return self._fix
+
+    @property
+    def mag(self) -> Vector:
         """(3,) FRD [gauss]."""
-        self.pressure_hpa = math.nan
-        """[hPa]."""
-        self.gps: GpsFix | None = None
-        """None before the first fix."""
+        field: Vector = self._record["mag"][0].copy()
+        return field
+
+    @property
+    def pressure_hpa(self) -> float:
+        """[hPa]; NaN before the first sample."""
+        return self._record["pressure_hpa"].item(0)
 
     def take(self, sample: SensorSample) -> None:
         """Take a tick's sample."""
         self.sample = sample
-        if sample.mag is not None:
-            self.mag = sample.mag
-        if sample.pressure_hpa is not None:
-            self.pressure_hpa = sample.pressure_hpa
         if sample.gps is not None:
-            self.gps = sample.gps
+            self._fix, self._fix_us = sample.gps, sample.time_us

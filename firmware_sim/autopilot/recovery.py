@@ -7,7 +7,7 @@ learn anew, or is turned to the yaw estimator's heading.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -36,10 +36,15 @@ class Moment(NamedTuple):
 class Recovery:
     """Watches velocities and headings, and restarts the filter with what they say is wrong."""
 
-    def __init__(self, state: Vector, error_filter: ErrorFilter, yaw: YawEstimator) -> None:
-        """Take the nominal state and its filter, which are changed, and the yaw estimator."""
+    def __init__(
+        self, state: Vector, error_filter: ErrorFilter, yaw: YawEstimator, record: Any = None
+    ) -> None:
+        """Take the nominal state and its filter, which are changed, and the yaw estimator.
+
+        `record` is that of the flight controller; None = a new one.
+        """
         self._state, self._filter, self._yaw = state, error_filter, yaw
-        self.consistency = Consistency()
+        self.consistency = Consistency(record)
         """Sees inertial sensors that have gone wrong."""
         self.compass = Compass()
         """Whether the compass is believed."""

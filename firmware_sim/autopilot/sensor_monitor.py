@@ -13,11 +13,18 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from airl_mav.core.constants import US_PER_S
 from firmware_sim.autopilot.autopilot_state import Message, Severity
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.events.definition import Event
 from firmware_sim.autopilot.events.enumerations import SensorFailure, SensorType
+from firmware_sim.engine.record import CHANGED, FIRST, SEEN, WATCHES
+from firmware_sim.engine.record import GPS as GPS_BIT
+from firmware_sim.engine.record import MAG as MAG_BIT
+from firmware_sim.engine.record import PRESSURE as PRESSURE_BIT
 from firmware_sim.interfaces import SensorSample
 
 NO_DATA_US = US_PER_S
@@ -87,13 +94,11 @@ GPS = SensorKind("GPS", "GPS 0", _gps, 1_000_000, 1_000_000)
 class SensorWatch:
     """One sensor under watch; looked at whenever it may have measured."""
 
-    def __init__(self, kind: SensorKind) -> None:
-        """Begin without a sample."""
+    def __init__(self, kind: SensorKind, times: NDArray[np.int64]) -> None:
+        """Begin without a sample; `times` (3,) is its row of `watch` (`engine.record`)."""
         self.kind = kind
         self._value: Any = None
-        self._first_us: int | None = None
-        self._seen_us: int | None = None
-        self._changed_us = 0
+        self._times = times
         self._noisy: bool | None = None
         """Whether its samples differ at rest, too; None = not known yet."""
         self.repeats = False
@@ -104,36 +109,44 @@ class SensorWatch:
     @property
     def seen(self) -> bool:
         """Whether it has ever measured."""
-        return self._seen_us is not None
+        return self._times.item(SEEN) >= 0
 
     def take(self, sample: SensorSample) -> None:
         """Take a sample in which it has measured."""
         value, now_us = self.kind.read(sample), sample.time_us
         self.repeats = value == self._value
-        if not self.repeats:
-            self._value, self._changed_us = value, now_us
-        if self._noisy is None:
-            self._learn(now_us)
-        self._seen_us = now_us
-
-    def _learn(self, now_us: int) -> None:
+        times = self._times
+        times[SEEN] = now_us
         if self.repeats:
-            self._noisy = False
-        elif self._first_us is None:
-            self._first_us = now_us
-        elif now_us - self._first_us >= LEARN_US:
+            self._noisy = self._noisy or False
+            return
+        self._value, times[CHANGED] = value, now_us
+        if times[FIRST] < 0:
+            times[FIRST] = now_us
+        self._learn()
+
+    def repeat(self, now_us: int) -> None:
+        """Note that its newest sample, which a compiled tick took, is that before."""
+        self.repeats, self._times[SEEN] = True, now_us
+        self._noisy = self._noisy or False
+
+    def _learn(self) -> None:
+        seen, _, first = self._times.tolist()
+        if self._noisy is None and first >= 0 and seen - first >= LEARN_US:
             self._noisy = True
 
     def judge(self, now_us: int, *, flying: bool) -> Message | None:
         """Return a text when it fails now. Standing still, a perfect sensor may repeat itself."""
-        if self._seen_us is None:
+        if not self.seen:
             return None
+        self._learn()
+        times = self._times
         if not (flying or self._noisy):
-            self._changed_us = self._seen_us
+            times[CHANGED] = times[SEEN]
         before = self.failed
-        if now_us - self._seen_us > self.kind.timeout_us:
+        if now_us - times[SEEN] > self.kind.timeout_us:
             self.failed = "TIMEOUT"
-        elif now_us - self._changed_us > self.kind.stale_us:
+        elif now_us - times[CHANGED] > self.kind.stale_us:
             self.failed = "STALE"
         else:
             self.failed = ""
@@ -145,20 +158,22 @@ class SensorWatch:
 
     def has_data(self, now_us: int) -> bool:
         """Return whether its data are valid for flight."""
-        seen_us = self._seen_us
-        if seen_us is None or now_us - seen_us >= NO_DATA_US:
+        seen_us, changed_us, _ = self._times.tolist()
+        if seen_us < 0 or now_us - seen_us >= NO_DATA_US:
             return False
-        return self.failed != "STALE" or now_us - self._changed_us < NO_DATA_US
+        return self.failed != "STALE" or now_us - changed_us < NO_DATA_US
 
 
 class SensorMonitor:
     """Watches all sensors of the vehicle."""
 
-    def __init__(self) -> None:
-        """Begin without a sample."""
-        self.gyro, self.accel = SensorWatch(GYRO), SensorWatch(ACCEL)
-        self.mag, self.baro, self.gps = SensorWatch(MAG), SensorWatch(BARO), SensorWatch(GPS)
-        self.all = (self.gyro, self.accel, self.mag, self.baro, self.gps)
+    def __init__(self, watch: NDArray[np.int64] | None = None) -> None:
+        """Begin without a sample, in `watch` (`engine.record`); None = a new one."""
+        times = np.full((WATCHES, 3), -1) if watch is None else watch
+        self.gyro, self.accel, self.mag, self.baro, self.gps = self.all = tuple(
+            SensorWatch(kind, row)
+            for kind, row in zip((GYRO, ACCEL, MAG, BARO, GPS), times, strict=True)
+        )
         self.distrusted = False
         """Whether `trusted` leaves something out of the newest sample."""
         self._flying = False
@@ -172,6 +187,23 @@ class SensorMonitor:
             self._take(self.baro, sample)
         if sample.gps is not None:
             self._take(self.gps, sample)
+
+    def repeated(self, time_us: int, measured: int, repeated: int) -> None:
+        """Note which sensors measured in a compiled tick, and which of them repeat themselves.
+
+        Args:
+            time_us: Of the tick [µs].
+            measured: Bits as `engine.record` has them.
+            repeated: The same.
+        """
+        self.distrusted = False
+        for bit, watch in ((MAG_BIT, self.mag), (PRESSURE_BIT, self.baro), (GPS_BIT, self.gps)):
+            if measured & bit:
+                watch.repeats = bool(repeated & bit)
+                if watch.repeats:
+                    watch.repeat(time_us)
+                if self._doubtful(watch):
+                    self.distrusted = True
 
     def _take(self, watch: SensorWatch, sample: SensorSample) -> None:
         watch.take(sample)

@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from airl_mav.control.controller import Controller, ControlSetpoints
 from airl_mav.control.demand import AnyDemand, AttitudeDemand, RateDemand
 from airl_mav.control.mixer import Motors
 from airl_mav.core.frames import Geodetic
@@ -36,6 +35,7 @@ from firmware_sim.autopilot.navigation.navigator import Navigator
 from firmware_sim.autopilot.navigation.plan import Plans
 from firmware_sim.autopilot.navigation.progress import progress
 from firmware_sim.autopilot.newest_sensors import NewestSensors
+from firmware_sim.engine.controller import Controller, ControlSetpoints
 from firmware_sim.interfaces import (
     BatterySample,
     DistanceReading,

@@ -17,6 +17,7 @@ the variance of the velocity where it takes a standard deviation; here it is giv
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -33,7 +34,8 @@ from airl_mav.vehicle.rotation import (
     rotate,
     yaw_of,
 )
-from firmware_sim.autopilot.turned_motion import TurnedMotion
+from firmware_sim.autopilot.error_state import GYRO_BIAS as _GYRO_BIAS
+from firmware_sim.autopilot.turned_motion import FELT, TurnedMotion, note_motion
 
 N_MODELS = 5
 TILT_GAIN = 0.2
@@ -78,7 +80,7 @@ MODEL_SIZE = 17
 # What the models share: smoothed specific force (3) [m/s²], whether the tilt is aligned, whether
 # velocities are fused, the result: heading [rad] and its variance [rad²]; and the velocity by the
 # IMU alone (2) [m/s], along a heading that differs from the first model's by what GPS turned that.
-FORCE, ALIGNED, STARTED, RESULT, VARIANCE, FELT, TURNED = 0, 3, 4, 5, 6, 7, 9
+FORCE, ALIGNED, STARTED, RESULT, VARIANCE, TURNED = 0, 3, 4, 5, 6, 9
 SHARED_SIZE = 10
 
 LONGEST = 64
@@ -163,7 +165,7 @@ def _predict(m: Vector, accel: Vec, dt: float) -> tuple[float, float]:
 
 
 @kernel
-def _feel(shared: Vector, north: float, east: float) -> None:
+def _add_change(shared: Vector, north: float, east: float) -> None:
     """Add a change of the first model's velocity, turned back by what GPS has turned the model."""
     c, s = math.cos(shared[TURNED]), math.sin(shared[TURNED])
     shared[FELT] += c * north + s * east
@@ -205,7 +207,7 @@ def advance(models: Vector, shared: Vector, gyro: Vector, accel: Vector, dt: flo
             if shared[STARTED] != 0.0:
                 north, east = _predict(models[j], a, dt)
                 if j == 0:
-                    _feel(shared, north, east)
+                    _add_change(shared, north, east)
 
 
 @kernel
@@ -293,6 +295,51 @@ def fuse(models: Vector, shared: Vector, north: float, east: float, accuracy: fl
         shared[STARTED], shared[VARIANCE] = 0.0, math.inf
 
 
+@kernel
+def feel(record: Any) -> None:
+    """Keep the IMU's sample in the record of a flight controller; predict when many are kept."""
+    at = 3 * record.yaw_count
+    for i in range(3):
+        record.yaw_gyro[at + i], record.yaw_accel[at + i] = record.gyro[i], record.accel[i]
+    record.yaw_count += 1
+    if record.yaw_count >= LONGEST:
+        predict_kept(record)
+
+
+@kernel
+def predict_kept(record: Any) -> None:
+    """Move all models by the kept samples."""
+    n = 3 * record.yaw_count
+    advance(record.yaw_models, record.yaw_shared, record.yaw_gyro[:n], record.yaw_accel[:n], TICK_S)
+    record.yaw_count = 0
+
+
+@kernel
+def observe(record: Any, north: float, east: float, accuracy: float) -> None:
+    """Take a GPS velocity into the record of a flight controller; as `YawEstimator.observe`."""
+    predict_kept(record)
+    if record.flying != 0:
+        fuse(record.yaw_models, record.yaw_shared, north, east, accuracy)
+        note_motion(record, north, east, accuracy)
+        return
+    record.motions = 0
+    record.yaw_shared[STARTED], record.yaw_shared[VARIANCE] = 0.0, math.inf
+    for j in range(N_MODELS):
+        for i in range(3):
+            # After position, velocity, attitude and rates of the nominal state.
+            record.yaw_models[j, BIAS + i] = record.state[_GYRO_BIAS + i]
+
+
+@kernel
+def _observe(records: Any, north: float, east: float, accuracy: float) -> None:
+    observe(records[0], north, east, accuracy)
+
+
+@kernel
+def _feel(records: Any) -> None:
+    feel(records[0])
+
+
 class YawEstimator:
     """Heading by IMU and GPS velocity.
 
@@ -300,16 +347,19 @@ class YawEstimator:
     predicting each at its time, and comes to the same.
     """
 
-    def __init__(self) -> None:
-        """Begin without a tilt."""
-        self._motion = TurnedMotion()
-        self.models = np.zeros((N_MODELS, MODEL_SIZE))
+    def __init__(self, record: Any = None) -> None:
+        """Begin without a tilt, in the record of a flight controller; None = in a new one."""
+        if record is None:
+            from firmware_sim.engine.record import new_controller
+
+            record = new_controller()
+        self._record = record
+        self._motion = TurnedMotion(record)
+        self.models = record["yaw_models"][0]
         """(N_MODELS, MODEL_SIZE)"""
         self.models[:, ATTITUDE] = 1.0
-        self._shared = np.zeros(SHARED_SIZE)
+        self._shared = record["yaw_shared"][0]
         self._shared[VARIANCE] = math.inf
-        self._gyro: list[Vector] = []
-        self._accel: list[Vector] = []
 
     @property
     def yaw(self) -> float:
@@ -327,11 +377,9 @@ class YawEstimator:
         return self.models[int(np.argmax(self.models[:, WEIGHT])), ATTITUDE:BIAS].copy()
 
     def feel(self, gyro: Vector, accel: Vector) -> None:
-        """Take a tick's sample of the IMU, each (3,) FRD [rad/s], [m/s²]; kept, not copied."""
-        self._gyro.append(gyro)
-        self._accel.append(accel)
-        if len(self._gyro) >= LONGEST:
-            self._advance()
+        """Take a tick's sample of the IMU, each (3,) FRD [rad/s], [m/s²]."""
+        self._record["gyro"], self._record["accel"] = gyro, accel
+        _feel(self._record)
 
     def observe(
         self, velocity: Vector, accuracy: float, gyro_bias: Vector, *, flying: bool
@@ -344,14 +392,9 @@ class YawEstimator:
             gyro_bias: What the estimator knows of it (3,) [rad/s], taken over on the ground.
             flying: Whether the vehicle is in the air.
         """
-        self._advance()
-        if flying:
-            fuse(self.models, self._shared, velocity.item(0), velocity.item(1), accuracy)
-            self._motion.take(self._shared[FELT : FELT + 2], velocity[:2], accuracy)
-            return
-        self._motion.restart()
-        self._shared[STARTED], self._shared[VARIANCE] = 0.0, math.inf
-        self.models[:, BIAS : BIAS + 3] = gyro_bias
+        self._record["flying"] = flying
+        self._record["state"][0, _GYRO_BIAS : _GYRO_BIAS + 3] = gyro_bias
+        _observe(self._record, velocity.item(0), velocity.item(1), accuracy)
 
     def explained(self, yaw: float) -> float:
         """Return how much of what GPS and a heading [rad] disagree in another explains, 0 to 1.
@@ -360,10 +403,3 @@ class YawEstimator:
         """
         along = self.models.item(0, YAW) - self._shared.item(TURNED)
         return self._motion.explained(yaw - along)
-
-    def _advance(self) -> None:
-        if self._gyro:
-            gyro, accel = np.concatenate(self._gyro), np.concatenate(self._accel)
-            self._gyro.clear()
-            self._accel.clear()
-            advance(self.models, self._shared, gyro, accel, TICK_S)

@@ -180,8 +180,9 @@ class Observer:
                     self._ignored += 1
         return counted
 
-    def send(self, now_us: int) -> None:
+    def send(self, now_us: int, flown: object = None) -> None:
         """Send the heartbeat and pending requests; once a tick, at simulated `now_us` [µs]."""
+        del flown  # external firmware packs its own telemetry
         self._now_us = now_us
         if self._heard is None:
             return

@@ -5,13 +5,13 @@ from __future__ import annotations
 from airl_mav.faults.kinds import MOTORS, SENSORS
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.vehicle.airframe import Airframe
+from firmware_sim.engine.dynamics import Speeds
 from firmware_sim.faults.actuation import misread, slowed, slowness, thrust_left, weakened
 from firmware_sim.faults.sensors import Effect, effect_of, failed
 from firmware_sim.faults.timeline import Acting, FaultTimeline
 from firmware_sim.faults.wind import Gusts, gust_at
 from firmware_sim.flight_controller import FlightController
 from firmware_sim.interfaces import ActuatorControls, SensorSample
-from firmware_sim.plant.dynamics import Speeds
 from firmware_sim.plant.plant import Plant
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from airl_mav.core.constants import TICK_S, US_PER_S
 from airl_mav.core.frames import Vector, local_to_geodetic
 from airl_mav.profiles.sensors import Sensors
+from firmware_sim.engine.ticks import PA_PER_HPA
 from firmware_sim.faults.timeline import Acting
 from firmware_sim.interfaces import (
     DistanceReading,
@@ -24,7 +25,6 @@ from firmware_sim.interfaces import (
     Odometry,
     SensorSample,
 )
-from firmware_sim.plant.sensors import PA_PER_HPA
 
 FIELDS = {
     "accel": "accel",

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
+from typing import Any
 
 from airl_mav.core.constants import TICK_US
 from firmware_sim.autopilot.autopilot_state import AutopilotState, Message
 from firmware_sim.autopilot.port import ParameterStore
+from firmware_sim.engine.record import Record
+from firmware_sim.flight_log.flown_state import FlownState, truth_of
 from firmware_sim.flight_log.topics import SENSOR_COMBINED, TOPICS
 from firmware_sim.flight_log.ulog import UlogWriter, Values
 from firmware_sim.flight_log.values import Moment, sensor_combined
-from firmware_sim.interfaces import SensorSample, Truth
 
 GRID_US = 5 * TICK_US
 """How often is looked for what is due [µs]: all intervals are multiples of it."""
@@ -58,8 +60,8 @@ class FlightLog:
         """Calendar time of its beginning [µs since 1970]."""
         self._due_us = [start_us] * len(TOPICS)
         self._last: list[Values | None] = [None] * len(TOPICS)
-        self._truth: Truth | None = None
-        """At the time of the newest sample, where all is logged."""
+        self._truth: Any = None
+        """The aircraft after the newest tick (`engine.record.TRUE_TICK`)."""
         self._parameters = parameters
         self._known = dict(_values(parameters))
         self._writer = UlogWriter(
@@ -105,18 +107,26 @@ class FlightLog:
         """Write out what is buffered, for somebody who reads it now."""
         self._writer.flush()
 
-    def before_tick(self, time_us: int, truth: Callable[[], Truth]) -> None:
-        """Note the true state where the coming tick, of simulated `time_us` [µs], is logged."""
-        self._truth = truth() if time_us % GRID_US == 0 else None
+    def after_ticks(self, flown: Record, truths: Record, state: AutopilotState) -> None:
+        """Log what is due in ticks.
 
-    def after_tick(self, sample: SensorSample, state: Callable[[], AutopilotState]) -> None:
-        """Log what is due; the sample is that which the tick took."""
+        Args:
+            flown: (n,) log of the flight controller (`engine.record.FLOWN_TICK`).
+            truths: (n,) log of the aircraft after each of them (`engine.record.TRUE_TICK`).
+            state: The autopilot's, after the last.
+        """
         if self._writer.lost:
             return
-        now_us, truth = sample.time_us, self._truth
-        self._writer.sample(_SAMPLES, now_us, sensor_combined(sample))
-        if truth is not None:
-            self._log(Moment(state(), truth, self._boot_unix_us + now_us), now_us)
+        rows = (flown[name].tolist() for name in ("time_us", "gyro", "accel"))
+        for k, (time_us, gyro, accel) in enumerate(zip(*rows, strict=True)):
+            self._writer.sample(_SAMPLES, time_us, sensor_combined(gyro, accel))
+            truth = truths[k - 1] if k else self._truth
+            if time_us % GRID_US == 0 and truth is not None:
+                moment = Moment(
+                    FlownState(state, flown[k]), truth_of(truth), self._boot_unix_us + time_us
+                )
+                self._log(moment, time_us)
+        self._truth = truths[-1].copy()
 
     def text(self, message: Message, time_us: int) -> None:
         """Log a text for the operator."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from airl_mav.core.constants import TICK_US, US_PER_S
@@ -15,7 +16,7 @@ from firmware_sim.autopilot.optical_flow import (
     LEAST_HEIGHT_M,
 )
 from firmware_sim.flight_log.ulog import Values
-from firmware_sim.interfaces import PoseFrame, SensorSample, Truth, VelocityFrame
+from firmware_sim.interfaces import PoseFrame, Truth, VelocityFrame
 
 NAVIGATION_STATES: dict[Mode, int] = {
     Mode.MANUAL: 0,
@@ -69,10 +70,10 @@ class Moment(NamedTuple):
     """Calendar time [µs since 1970]."""
 
 
-def sensor_combined(sample: SensorSample) -> Values:
-    """Return the newest IMU sample, raw: FRD [rad/s], [m/s²]."""
+def sensor_combined(gyro: Sequence[float], accel: Sequence[float]) -> Values:
+    """Return an IMU sample, raw: FRD [rad/s], [m/s²]."""
     offset_us, clipping = 0, (0, 0)
-    return (*sample.gyro.tolist(), TICK_US, offset_us, *sample.accel.tolist(), TICK_US, *clipping)
+    return (*gyro, TICK_US, offset_us, *accel, TICK_US, *clipping)
 
 
 def angular_velocity(moment: Moment) -> Values:

@@ -191,6 +191,20 @@ class Encoder:
         self._mav.srcSystem = system_id
         self._ids = bytes([system_id, self._component_id])
 
+    @property
+    def system_id(self) -> int:
+        """System id of the sender."""
+        return self._ids[0]
+
+    @property
+    def sequence(self) -> int:
+        """Sequence number of the next frame."""
+        return self._seq
+
+    def skip(self, frames: int) -> None:
+        """Count frames that something else has packed."""
+        self._seq = (self._seq + frames) & 0xFF
+
     def pack(self, message: WireMessage) -> bytes:
         """Return the frame of a message.
 

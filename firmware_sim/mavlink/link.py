@@ -6,8 +6,10 @@ import struct
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
+from airl_mav.core.frames import Vector
 from airl_mav.core.signing import Signing
 from firmware_sim.autopilot.autopilot_state import AutopilotState
+from firmware_sim.engine.record import Record
 from firmware_sim.mavlink.codec import (
     SYSTEM_ID,
     Decoder,
@@ -22,6 +24,8 @@ from firmware_sim.mavlink.endpoint import Endpoint, SharedEndpoint
 from firmware_sim.mavlink.rates import GCS_HZ, GIMBAL_HZ, ONBOARD_HZ, PAYLOAD_HZ, interval_us
 from firmware_sim.mavlink.scheduler import StreamScheduler
 from firmware_sim.mavlink.streams import Builder
+from firmware_sim.mavlink.telemetry import NUMBERS, Ints, Packer
+from firmware_sim.mavlink.telemetry import payload as fast_payload
 
 Payloads = dict[Builder, "bytes | None"]
 """What has been built and packed in one tick, for all links together: None = nothing to send,
@@ -107,8 +111,8 @@ class Link:
     def __init__(
         self,
         config: LinkConfig,
-        builders: Mapping[str, Builder],
-        replies: Mapping[str, Builder] | None = None,
+        builders: Mapping[str, Builder | None],
+        replies: Mapping[str, Builder | None] | None = None,
         *,
         endpoint: Endpoint | None = None,
         system_id: int = SYSTEM_ID,
@@ -124,13 +128,18 @@ class Link:
         self.builders = builders
         names = [*config.rates_hz, *(name for name in builders if name not in config.rates_hz)]
         self.scheduler = StreamScheduler(
-            names, {name: interval_us(hz) for name, hz in config.rates_hz.items()}
+            names, {name: interval_us(hz) for name, hz in config.rates_hz.items()}, NUMBERS
         )
+        self._packer = Packer()
         self.tap: Callable[[Sequence[bytes]], None] | None = None
         """Called with the frames of both directions, if set."""
         self.ignored = 0
         self.endpoint = config.endpoint if endpoint is None else endpoint
-        self._streams = {name: (layout(name), builder) for name, builder in builders.items()}
+        self._streams = {
+            name: (layout(name), builder)
+            for name, builder in builders.items()
+            if builder is not None
+        }
         self._replies = builders if replies is None else replies
         self._stream_encoder = Encoder(system_id)
         self._reply_encoder = (
@@ -205,7 +214,11 @@ class Link:
 
     def send_stream(self, name: str, state: AutopilotState) -> bool:
         """Send one of the streamed messages now; return whether there was something to send."""
-        payload = _payload(layout(name), self._replies[name](state))
+        builder = self._replies[name]
+        if builder is None:
+            payload = fast_payload(name, state)
+        else:
+            payload = _payload(layout(name), builder(state))
         if payload is None:
             return False
         if payload:
@@ -254,6 +267,24 @@ class Link:
                 frames.append(encoder.frame(shape, payload))
             elif payload is not None:
                 self._unsendable += 1
+
+    def stream_fast(self, flown: Record, times_us: Ints, context: Vector, most: int) -> None:
+        """Add the fast streams of n ticks to the telemetry.
+
+        Args:
+            flown: (n,) logs of the ticks.
+            times_us: (n,) when each ended [µs].
+            context: As `telemetry.context_of`.
+            most: Frames a tick, at most.
+        """
+        plan, encoder = self.scheduler, self._stream_encoder
+        frames = self._packer.pack(
+            *(flown, times_us, context, plan.numbers, plan.due_us, plan.intervals_us),
+            *(encoder.system_id, encoder.sequence, most),
+        )
+        encoder.skip(len(frames))
+        plan.packed()
+        self._pending += frames
 
     def flush(self) -> None:
         """Send the telemetry that has been added."""

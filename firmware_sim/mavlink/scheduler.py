@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from heapq import heapify, heapreplace
+from types import MappingProxyType
+
+import numpy as np
 
 from airl_mav.core.constants import TICK_US
 
 OFF = 0
 """Interval of a stream that is not sent."""
+
+_NEVER = np.iinfo(np.int64).max
+_NONE: Mapping[str, int] = MappingProxyType({})
 
 
 class StreamScheduler:
@@ -18,25 +23,45 @@ class StreamScheduler:
     was sent, so rates are exact over any span. First due times are staggered by one tick each, so
     that the slow streams do not all fall into the same tick. A stream is due at most once per
     call; one that fell behind skips what it missed.
+
+    Fast streams are packed by compiled code (`telemetry`), which takes the arrays; `due` names the
+    others.
     """
 
-    def __init__(self, names: Sequence[str], default_us: Mapping[str, int]) -> None:
+    def __init__(
+        self,
+        names: Sequence[str],
+        default_us: Mapping[str, int],
+        fast: Mapping[str, int] = _NONE,
+    ) -> None:
         """Start at simulated time 0 with the default intervals [µs].
 
-        The order of the names is that within a tick; one without a default is off.
+        Args:
+            names: All streams, in their order within a tick.
+            default_us: Their intervals; one without a default is off.
+            fast: Places of the fast streams in the table of compiled code.
         """
         self._names = tuple(names)
         self._index = {name: i for i, name in enumerate(self._names)}
         self._default = [default_us.get(name, OFF) for name in self._names]
-        self._interval = list(self._default)
-        self._heap: list[tuple[int, int]] = []
-        """Due time [µs] and index of each stream that is on."""
+        self.numbers = np.array([fast.get(name, -1) for name in self._names], np.int64)
+        """(s,) places of the fast streams in the table; -1 = not a fast stream."""
+        self.intervals_us = np.array(self._default, np.int64)
+        """(s,) intervals [µs]; `OFF` = not sent."""
+        self.due_us = np.zeros(len(self._names), np.int64)
+        """(s,) next times [µs]."""
+        self._slow = np.flatnonzero(self.numbers < 0)
+        self._fast = np.flatnonzero(self.numbers >= 0)
+        self.fast_us = 0
+        """When the next of the fast streams is due, or earlier [µs]."""
+        self._next_us = 0
+        """When the next of the others is due [µs]."""
         self._rebase_pending = False
         self._rebase(0)
 
     def interval_us(self, name: str) -> int:
         """Return a stream's interval [µs], `OFF` when it is not sent."""
-        return self._interval[self._index[name]]
+        return self.intervals_us.item(self._index[name])
 
     def default_us(self, name: str) -> int:
         """Return a stream's default interval [µs], `OFF` when it is off by default."""
@@ -47,39 +72,41 @@ class StreamScheduler:
         if interval_us < 0:
             raise ValueError(f"interval_us={interval_us}: must be >= 0")
         index = self._index[name]
-        if interval_us == self._interval[index]:
+        if interval_us == self.intervals_us[index]:
             return
-        self._interval[index] = interval_us
-        self._heap = [entry for entry in self._heap if entry[1] != index]
-        if interval_us != OFF:
-            self._heap.append((now_us, index))
-        heapify(self._heap)
+        self.intervals_us[index] = interval_us
+        self.due_us[index] = _NEVER if interval_us == OFF else now_us
+        self._next_us = self.fast_us = min(self._next_us, self.fast_us, now_us)
 
     def restart(self) -> None:
-        """Keep the intervals, take the time base from the next `due` call (it may have jumped)."""
+        """Keep the intervals, take the time base from the next call (it may have jumped)."""
         self._rebase_pending = True
+
+    def packed(self) -> None:
+        """Take note that fast streams were packed, and planned anew."""
+        self.fast_us = int(np.minimum.reduce(self.due_us[self._fast], initial=_NEVER))
+
+    def begin(self, now_us: int) -> None:
+        """Take simulated `now_us` [µs] for the time base, where that is asked for."""
+        if self._rebase_pending:
+            self._rebase(now_us)
 
     def due(self, now_us: int) -> list[str]:
         """Return the streams to send at `now_us` [µs] and plan their next time."""
-        if self._rebase_pending:
-            self._rebase(now_us)
-        heap = self._heap
-        names: list[str] = []
-        while heap and heap[0][0] <= now_us:
-            due_us, index = heap[0]
-            interval = self._interval[index]
-            next_us = due_us + interval
-            if next_us <= now_us:
-                next_us = now_us + interval - (now_us - due_us) % interval
-            heapreplace(heap, (next_us, index))
-            names.append(self._names[index])
-        return names
+        self.begin(now_us)
+        if now_us < self._next_us or not len(self._slow):
+            return []
+        due_us = self.due_us[self._slow]
+        (late,) = (due_us <= now_us).nonzero()
+        order = sorted(zip(due_us[late].tolist(), self._slow[late].tolist(), strict=True))
+        intervals = self.intervals_us[self._slow[late]]
+        due_us[late] += intervals * (1 + (now_us - due_us[late]) // intervals)
+        self.due_us[self._slow] = due_us
+        self._next_us = int(np.minimum.reduce(due_us))
+        return [self._names[i] for _, i in order]
 
     def _rebase(self, now_us: int) -> None:
         self._rebase_pending = False
-        self._heap = [
-            (now_us + index * TICK_US % interval, index)
-            for index, interval in enumerate(self._interval)
-            if interval != OFF
-        ]
-        heapify(self._heap)
+        for i, interval in enumerate(self.intervals_us.tolist()):
+            self.due_us[i] = _NEVER if interval == OFF else now_us + i * TICK_US % interval
+        self._next_us = self.fast_us = now_us

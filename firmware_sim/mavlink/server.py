@@ -6,12 +6,16 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import chain
 
+import numpy as np
+
 from airl_mav.core.clock import Clock
-from airl_mav.core.constants import US_PER_S
+from airl_mav.core.constants import TICK_US, US_PER_S
+from airl_mav.core.frames import Vector
 from airl_mav.core.signing import Signing
 from airl_mav.core.signing_key import StoredSigning
 from firmware_sim.autopilot.autopilot_state import AutopilotState, Message
 from firmware_sim.autopilot.port import AutopilotPort
+from firmware_sim.engine.record import Record
 from firmware_sim.interfaces import Truth
 from firmware_sim.mavlink.allowance import Allowance
 from firmware_sim.mavlink.clients import Client, Clients
@@ -29,6 +33,7 @@ from firmware_sim.mavlink.services.context import Context
 from firmware_sim.mavlink.services.running_calibration import RunningCalibration
 from firmware_sim.mavlink.streams import BUILDERS, Builder
 from firmware_sim.mavlink.streams.status import system_time
+from firmware_sim.mavlink.telemetry import context_of, flown_of
 from firmware_sim.mavlink.texts import REPLY_IDS, TextEncoder
 from firmware_sim.mavlink.tick_time import TickTime
 from firmware_sim.mavlink.tlog import TlogWriter
@@ -115,7 +120,7 @@ class MavlinkServer:
         self._senders = Senders()
         self.strangers = self._senders.strangers
         # The same functions on every link: what two links send in one tick is built once.
-        self._builders: dict[str, Builder] = {
+        self._builders: dict[str, Builder | None] = {
             **BUILDERS,
             "SYSTEM_TIME": system_time(boot_unix_us),
             **self._streams.builders,
@@ -167,53 +172,69 @@ class MavlinkServer:
             self._send_texts()
         return effective
 
-    def send(self, now_us: int) -> None:
+    def send(self, now_us: int, flown: Record | None = None) -> None:
         """Send texts, pending parameters and the streams that are due at simulated `now_us` [µs].
 
-        To be called once per tick.
+        Args:
+            now_us: Time after the newest tick.
+            flown: (n,) logs of the ticks since the last call; None = of one tick, as the
+                autopilot's state is now.
         """
         self._now_us = now_us
         self._tick_time.renew(now_us)
         port = self._port
         if port is None:
             return
-        sample = port.sample
-        if sample is not None:
-            self._streams.vibration.update(sample)
+        if port.sample is None:
+            return
+        state: AutopilotState | None = None
+        if flown is None:
+            flown, times_us = flown_of(port.state()), np.array([now_us])
+        else:
+            times_us = flown["time_us"] + TICK_US
+        self._streams.vibration.update(flown)
         texts = list(dict.fromkeys(port.take_messages()))  # once a tick; as `_announce`
         for event in port.take_events():
             self._events.add(event, now_us)
         everyone = list(self._all())
         self._send_pending(everyone, now_us)
-        state: AutopilotState | None = None
+        context: Vector | None = None
         payloads: Payloads = {}
         for clients in self._links:
             clients.renew()
         due = [(client, client.due(now_us)) for client in everyone]
+        most = max(1, STREAMS_PER_TICK // (2 * max(1, len(due))))
         share = _share([len(names) for _, names in due])
         for client, names in due:
             link = client.link
+            if link.scheduler.fast_us <= now_us:
+                state = state or port.state()
+                context = context_of(state) if context is None else context
+                link.stream_fast(flown, times_us, context, most)
             if texts or (client.events is not None and client.events.has_news(now_us)):
                 _stream_news(client, texts, now_us)
             if len(names) > share:
                 names, client.late = names[:share], names[share:]
             if names or client.announced_origin is None:
                 # Not in every tick: the snapshot costs more than asking the schedulers.
-                if state is None:
-                    state = port.state()
+                state = state or port.state()
                 if state.origin is not None and state.origin != client.announced_origin:
                     client.announced_origin = state.origin
                     link.stream_due(("GPS_GLOBAL_ORIGIN",), state, payloads)
                 link.stream_due(names, state, payloads)
             link.flush()
         if now_us >= self._forget_us:
-            self._forget_us = now_us + FORGET_EVERY_US
-            for clients in self._links:
-                clients.forget_silent(now_us)
-                for text in self._complaints.due(clients.name, clients.counters, now_us):
-                    _tell(clients, text)
-            if self._stored is not None:
-                self._stored.save_due()
+            self._forget(now_us)
+
+    def _forget(self, now_us: int) -> None:
+        """Forget silent clients, complain of floods, save the newest time stamp of signatures."""
+        self._forget_us = now_us + FORGET_EVERY_US
+        for clients in self._links:
+            clients.forget_silent(now_us)
+            for text in self._complaints.due(clients.name, clients.counters, now_us):
+                _tell(clients, text)
+        if self._stored is not None:
+            self._stored.save_due()
 
     def _send_pending(self, clients: Sequence[Client], now_us: int) -> None:
         """Send clients what is next of what they get piece by piece.
@@ -317,7 +338,7 @@ class MavlinkServer:
                 for client, _message in clients.receive(self._now_us):
                     client.link.ignored += 1
 
-    def _link_builders(self) -> dict[str, Builder]:
+    def _link_builders(self) -> dict[str, Builder | None]:
         return {
             **self._builders,
             "PING": peers.ping_requests(),
@@ -383,9 +404,9 @@ def _tell(clients: Iterable[Client], text: Message) -> None:
 
 def _share(asked: Sequence[int]) -> int:
     """Return how many streamed messages each client may get in a tick, of those it asks for."""
-    if sum(asked) <= STREAMS_PER_TICK:
-        return STREAMS_PER_TICK
-    return max(1, STREAMS_PER_TICK // sum(1 for number in asked if number))
+    if sum(asked) <= STREAMS_PER_TICK // 2:
+        return STREAMS_PER_TICK // 2
+    return max(1, STREAMS_PER_TICK // 2 // sum(1 for number in asked if number))
 
 
 def _system_id(port: AutopilotPort) -> int:

@@ -59,6 +59,19 @@ class Body(Protocol):
         """
         ...
 
+    @property
+    def radius_m(self) -> float:
+        """Half diagonal of its collision box [m]."""
+        ...
+
+    def follow(self, motion: Vector) -> None:
+        """Take the vehicle to be in a motion (16,) that something else has computed."""
+        ...
+
+    def look_around(self) -> None:
+        """Take what moves to be elsewhere: time has passed without a `move`."""
+        ...
+
     def rest(self) -> Vector:
         """Return the motion (16,) now, the vehicle taken to be at rest or in steady flight."""
         ...

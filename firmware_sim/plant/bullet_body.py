@@ -19,9 +19,16 @@ from airl_mav.core.frames import (
 from airl_mav.profiles.vehicle import Body as BodyProfile
 from airl_mav.vehicle.airframe import Airframe
 from airl_mav.vehicle.rotation import Quat, Vec
+from firmware_sim.engine.kinematics import (
+    POSITION,
+    QUATERNION,
+    RATES,
+    VELOCITY,
+    WIDTH,
+    from_bullet,
+)
 from firmware_sim.plant.body import NOTHING, Touch
 from firmware_sim.plant.bullet import pybullet
-from firmware_sim.plant.kinematics import WIDTH, from_bullet
 from firmware_sim.plant.world import World, WorldState
 
 _ANY_LINK = -2
@@ -47,7 +54,9 @@ class BulletBody:
         """
         self._made_of = arena, body, airframe, tick_s
         diagonal_m = math.hypot(body.width_m, body.width_m, body.height_m)
-        self.world = World(arena, 0.5 * diagonal_m, tick_s)
+        self.radius_m = 0.5 * diagonal_m
+        """Half diagonal of its collision box [m]."""
+        self.world = World(arena, self.radius_m, tick_s)
         self._tick_s = tick_s
         self.number = self._build(body, airframe)
         """pybullet's number of it."""
@@ -82,14 +91,14 @@ class BulletBody:
         world.move_obstacles(moving_us, before)
         pybullet.stepSimulation(client)
         contacts = pybullet.getContactPoints(number, -1, _ANY_LINK, _ANY_LINK, client)
-        if contacts:
+        close, pressed = set(), set()
+        for contact in contacts:
             # Index 2 is body B, index 9 the normal force: 0 = close but not touching.
-            self.touch = Touch(
-                frozenset(contact[2] for contact in contacts),
-                frozenset(contact[2] for contact in contacts if contact[9] > 0.0),
-            )
-        else:
-            self.touch = NOTHING
+            close.add(contact[2])
+            if contact[9] > 0.0:
+                pressed.add(contact[2])
+        if close != self.touch.close or pressed != self.touch.pressed:
+            self.touch = Touch(frozenset(close), frozenset(pressed)) if close else NOTHING
         return self._read(before)
 
     def put(
@@ -100,13 +109,21 @@ class BulletBody:
         rates: Vec = _STILL,
     ) -> Vector:
         """Put it somewhere; as `Body`."""
-        client, number = self.world.client, self.number
-        attitude = quat_wxyz_to_xyzw(quat_ned_frd_to_enu_flu(np.array(quaternion)))
-        client.resetBasePositionAndOrientation(number, ned_to_enu(np.array(position)), attitude)
-        spin = ned_to_enu(quat_to_matrix(np.array(quaternion)) @ np.array(rates))
-        client.resetBaseVelocity(number, ned_to_enu(np.array(velocity)), spin)
-        self.touch = NOTHING
+        self.follow(np.array([*position, *velocity, *quaternion, *rates]))
         return self.rest()
+
+    def look_around(self) -> None:
+        """Do nothing: every `move` puts what moves where it is."""
+
+    def follow(self, motion: Vector) -> None:
+        """Take the vehicle to be in a motion (>= 13,); as `Body`."""
+        client, number = self.world.client, self.number
+        quaternion = motion[QUATERNION]
+        attitude = quat_wxyz_to_xyzw(quat_ned_frd_to_enu_flu(quaternion))
+        client.resetBasePositionAndOrientation(number, ned_to_enu(motion[POSITION]), attitude)
+        spin = ned_to_enu(quat_to_matrix(quaternion) @ motion[RATES])
+        client.resetBaseVelocity(number, ned_to_enu(motion[VELOCITY]), spin)
+        self.touch = NOTHING
 
     def rest(self) -> Vector:
         """Return the motion (16,), the vehicle taken to be at rest or in steady flight."""

@@ -9,38 +9,25 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.geometry import Arena, Shape
-from airl_mav.arena.ground import Relief, no_relief
+from airl_mav.arena.geometry import Arena
 from airl_mav.core.frames import Vector
 from airl_mav.core.kernels import kernel
 from airl_mav.profiles.vehicle import Body as BodyProfile
 from airl_mav.vehicle.airframe import Airframe, airframe_of
 from airl_mav.vehicle.rigid_body import accelerate, drift
 from airl_mav.vehicle.rotation import Quat, Vec, conjugate, rotate
-from firmware_sim.plant.body import FLOOR, NOTHING, Touch, walls_of
+from firmware_sim.engine.kinematics import WIDTH, quaternion, rates, velocity, write
+from firmware_sim.plant.body import FLOOR, NOTHING, Touch
 from firmware_sim.plant.contacts.box import BREAKING_SHARE, MOST, ROW
 from firmware_sim.plant.contacts.convex import touch_obstacle
 from firmware_sim.plant.contacts.floor import FLOOR_ID, KEPT, touch_floor
 from firmware_sim.plant.contacts.ground import near_ground, touch_ground
 from firmware_sim.plant.contacts.solver import resolve
-from firmware_sim.plant.kinematics import WIDTH, quaternion, rates, velocity, write
-from firmware_sim.plant.tours import place_at, tour_arrays
+from firmware_sim.plant.solids import Solids, greatest_speed, room_among, solids_of
+from firmware_sim.plant.tours import place_at
 
 _FIRST = FLOOR_ID + 1
 """Number of the first wall or obstacle."""
-
-
-class Solids(NamedTuple):
-    """Walls and obstacles of an arena, n of them, of which the last m move; and its ground."""
-
-    shape: NDArray[np.int8]  # (n,)
-    center: Vector  # (n, 3) NED [m]; of those that move it is updated
-    size: Vector  # (n, 3) half extents [m]
-    yaw: Vector  # (n,) [rad]
-    times_s: Vector  # (m, 1 + k) as `tour_arrays`
-    points: Vector  # (m, k, 2)
-    leg: NDArray[np.int64]  # (m,)
-    relief: Relief
 
 
 class State(NamedTuple):
@@ -51,63 +38,6 @@ class State(NamedTuple):
     room: Vector  # (1,) walls and obstacles are at least this far off [m]
     rows: Vector  # (MOST, ROW) contacts of the newest tick
     impulses: Vector  # (MOST,) theirs [N s]
-
-
-def solids_of(arena: Arena | None) -> tuple[Solids, list[str]]:
-    """Return the walls, obstacles and ground of an arena, and their names; None has none."""
-    if arena is None:
-        return (
-            Solids(
-                np.zeros(0, np.int8),
-                np.zeros((0, 3)),
-                np.zeros((0, 3)),
-                np.zeros(0),
-                np.full((0, 2), np.inf),
-                np.zeros((0, 1, 2)),
-                np.zeros(0, np.int64),
-                no_relief(),
-            ),
-            [],
-        )
-    walls, o = walls_of(arena), arena.obstacles
-    times, points = tour_arrays(arena)
-    solids = Solids(
-        np.concatenate([np.full(len(walls), Shape.BOX, np.int8), o.shape]),
-        np.concatenate([np.array([center for _, center, _ in walls]), o.center]),
-        np.concatenate([np.array([half for _, _, half in walls]), o.half_size]),
-        np.concatenate([np.zeros(len(walls)), o.yaw]),
-        times,
-        points,
-        np.zeros(len(arena.tours), np.int64),
-        no_relief() if arena.ground is None else arena.ground.relief,
-    )
-    return solids, [name for name, _, _ in walls] + [arena.name_of(i) for i in range(len(o))]
-
-
-def _greatest_speed(solids: Solids) -> float:
-    """Return how fast the fastest moving obstacle is [m/s]."""
-    fastest = 0.0
-    for times, points in zip(solids.times_s, solids.points, strict=True):
-        passed = times[1:][np.isfinite(times[1:])]
-        ways = np.hypot(*np.diff(points[: len(passed)], axis=0).T)
-        took = np.diff(passed)
-        if len(took):
-            fastest = max(fastest, float(np.max(ways / took)))
-    return fastest
-
-
-@kernel
-def _room(solids: Solids, p: Vec, radius: float) -> float:
-    """Return a distance [m] that a sphere around the vehicle surely is from walls and obstacles."""
-    room: float = math.inf
-    for i in range(len(solids.shape)):
-        c, s = math.cos(solids.yaw[i]), math.sin(solids.yaw[i])
-        dx, dy = p[0] - solids.center[i, 0], p[1] - solids.center[i, 1]
-        x = max(0.0, abs(c * dx + s * dy) - solids.size[i, 0])
-        y = max(0.0, abs(c * dy - s * dx) - solids.size[i, 1])
-        z = max(0.0, abs(p[2] - solids.center[i, 2]) - solids.size[i, 2])
-        room = min(room, math.sqrt(x * x + y * y + z * z))
-    return room - radius
 
 
 @kernel
@@ -134,7 +64,7 @@ def _find_contacts(
         north, east = place_at(moving_us, solids.times_s, solids.points, solids.leg, i)
         solids.center[n - moving + i, 0] = north
         solids.center[n - moving + i, 1] = east
-    state.room[0] = _room(solids, p, radius)
+    state.room[0] = room_among(solids, p, radius)
     if state.room[0] > close:
         return count
     for i in range(n):
@@ -228,11 +158,12 @@ class KernelBody:
         self._solids, names = solids_of(arena)
         self.names: Mapping[int, str] = dict(enumerate([FLOOR, *names], start=FLOOR_ID))
         self._half = np.array([0.5 * body.width_m, 0.5 * body.width_m, 0.5 * body.height_m])
-        radius = float(np.linalg.norm(self._half))
+        self.radius_m = radius = float(np.linalg.norm(self._half))
+        """Half diagonal of its collision box [m]."""
         self._box = radius, BREAKING_SHARE * radius
         self._airframe = np.array(airframe)
         self._tick_s = tick_s
-        self._obstacle_speed = _greatest_speed(self._solids)
+        self._obstacle_speed = greatest_speed(self._solids)
         self._state = State(
             np.zeros((KEPT, 7)),
             np.zeros(1, np.int64),
@@ -278,6 +209,15 @@ class KernelBody:
         else:
             self.touch = NOTHING
         return row
+
+    def look_around(self) -> None:
+        """Take what moves to be elsewhere; as `Body`."""
+        self._state.room[0] = -math.inf
+
+    def follow(self, motion: Vector) -> None:
+        """Take the vehicle to be elsewhere; as `Body`."""
+        del motion  # `move` takes it
+        self._state.many[0], self._state.room[0] = 0, -math.inf
 
     def put(
         self,

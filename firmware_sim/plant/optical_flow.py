@@ -11,9 +11,9 @@ from airl_mav.core.frames import Vector
 from airl_mav.core.kernels import kernel
 from airl_mav.profiles.sensors import OpticalFlow
 from airl_mav.vehicle.rotation import conjugate, rotate
+from firmware_sim.engine.kinematics import POSITION, QUATERNION, quaternion, rates, velocity
 from firmware_sim.interfaces import FlowReading
 from firmware_sim.plant.downward_ray import DownwardRay
-from firmware_sim.plant.kinematics import POSITION, QUATERNION, quaternion, rates, velocity
 from firmware_sim.plant.sensors import Rate, White
 
 BEST, INVALID = 255, 0

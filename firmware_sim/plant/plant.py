@@ -18,23 +18,39 @@ from airl_mav.vehicle.power import PowerModel, standing_power_w
 from airl_mav.vehicle.rotation import Quat, Vec
 from airl_mav.vehicle.rotor import lag
 from airl_mav.vehicle.wind import Wind
+from firmware_sim.engine.dynamics import Speeds, pack_row, supply
+from firmware_sim.engine.kinematics import POSITION, QUATERNION, RATES, VELOCITY
+from firmware_sim.engine.record import IDLE, Record, new_aircraft
+from firmware_sim.engine.ticks import (
+    COLLIDED,
+    DETECTED,
+    EVENT_BITS,
+    EVENT_MASK,
+    FUSE,
+    NOISE,
+    NONE,
+    ROOM,
+    ROOM_M,
+    begin_touch,
+    end_touch,
+    finish_record,
+    push_record,
+    rest_record,
+    stretch,
+)
 from firmware_sim.interfaces import ActuatorControls, BatterySample, SensorSample, Truth
 from firmware_sim.plant.bodies import new_body
 from firmware_sim.plant.body import FLOOR, Body, Touch
-from firmware_sim.plant.dynamics import (
-    Speeds,
-    absorb,
-    actuate,
-    pack_row,
-    supply,
-)
-from firmware_sim.plant.kinematics import POSITION, QUATERNION, RATES, VELOCITY
 from firmware_sim.plant.optical_flow import PlantOpticalFlow
 from firmware_sim.plant.rangefinder import PlantRangefinder
+from firmware_sim.plant.room import Room
 from firmware_sim.plant.sensors import SensorSuite
 
 REST_SPEED_M_S = 0.1
 """Touching the floor slower than this is resting, no collision (AirSim's kRestingVelocityMax)."""
+
+STILL = 1e-4
+"""A vehicle rests below this speed [m/s], turn rate [rad/s] and share of the rotors' full speed."""
 
 STOPPED: Speeds = (0.0, 0.0, 0.0, 0.0)
 
@@ -89,10 +105,16 @@ class Plant:
         self.collisions: list[Collision] = []
         """Latched collision events, oldest first."""
         airframe = airframe or Airframe.from_profile(profile)
+        self.record = record = new_aircraft()
+        """Body, rotors, battery and sensors."""
         noise, gusts = sensors_and_gusts(rng)
-        self._sensors = SensorSuite(profile.sensors, noise, tick_s, asked.sensors.navigation_noise)
+        self._sensors = SensorSuite(
+            profile.sensors, noise, tick_s, asked.sensors.navigation_noise, record
+        )
         self.wind: Blowing = Wind(asked.wind, gusts, tick_s)
-        """Asked once a tick for what blows; to be replaced between two ticks."""
+        """Asked for what blows; to be replaced between two ticks."""
+        self._winds = np.zeros((0, 3))
+        """Wind NED [m/s] of the coming ticks; a single row does not change."""
         fitted, times = profile.sensors.rangefinder, asked.sensors.navigation_noise
         self._rangefinder = None
         if fitted is not None:
@@ -102,37 +124,73 @@ class Plant:
         self._flow = None
         if flow is not None:
             self._flow = PlantOpticalFlow(flow, arena, noise.spawn(1)[0], times, tick_s)
-        self._start_us = start_us
-        self._moves_us = start_us
-        """When moving obstacles set out."""
-        self.time_us = start_us
-        """Simulated time of the newest tick [µs]."""
-        self._rate_hz, self._tick_s, self._ticks = rate_hz, tick_s, 0
-        # What kernels take, as arrays: names would cost their callers a microsecond each.
-        self._airframe = np.array(airframe)
         model = PowerModel.from_profile(profile)
-        self._power = np.array(model)
-        self._computer_w = computer_w
-        self._pack = np.array(pack_row(profile.battery))
         self.rotor_lag = lag(airframe, tick_s)
         """Share of an error of its speed that a rotor keeps over a tick."""
-        self._speeds = STOPPED
-        self.battery_remaining = asked.battery_charge
-        """State of charge, 1 to 0."""
-        self.power_w = standing_power_w(0.0, airframe, model)
-        """Electrical power over the newest tick, without the onboard computer's [W]."""
-        self._felt: Vec = (0.0, 0.0, 0.0)
+        pack, power_w = pack_row(profile.battery), standing_power_w(0.0, airframe, model)
         self.body: Body = new_body(asked.plant, arena, profile.body, airframe, tick_s)
         """What is moved among the bodies of the arena."""
+        self._room = Room(arena, self.body.radius_m)
+        for name, value in (
+            ("airframe", airframe),
+            ("power_model", model),
+            ("pack", pack),
+            ("rotor_lag", self.rotor_lag),
+            ("computer_w", computer_w),
+            ("tick_s", tick_s),
+            ("rate_hz", rate_hz),
+            ("start_us", start_us),
+            ("moves_us", start_us),
+            ("closing_m_s", self._room.closing_m_s),
+            ("time_us", start_us),
+            ("charge", asked.battery_charge),
+            ("power_w", power_w),
+            ("motion", self.body.rest()),
+            ("battery", supply(power_w + computer_w, asked.battery_charge, np.array(pack))),
+        ):
+            record[name] = value
+        self._motion = record["motion"][0]
         self._touching: frozenset[int] = frozenset()
-        self.motion = self.body.rest()
-        """Motion (16,) as `plant.kinematics`; another array after every tick, not to be changed."""
-        load_w = self.power_w + computer_w
-        self._battery = BatterySample(*supply(load_w, self.battery_remaining, self._pack))
+        self._away = False
+        """Whether the body lies behind: the vehicle has glided since it was moved last."""
+
+    @property
+    def time_us(self) -> int:
+        """Simulated time of the newest tick [µs]."""
+        return self.record["time_us"].item(0)
+
+    @property
+    def motion(self) -> Vector:
+        """Motion (16,) as `plant.kinematics`; a copy."""
+        return self._motion.copy()
+
+    @property
+    def battery_remaining(self) -> float:
+        """State of charge, 1 to 0."""
+        return self.record["charge"].item(0)
+
+    @battery_remaining.setter
+    def battery_remaining(self, charge: float) -> None:
+        self.record["charge"] = charge
+
+    @property
+    def power_w(self) -> float:
+        """Electrical power over the newest tick, without the onboard computer's [W]."""
+        return self.record["power_w"].item(0)
+
+    @property
+    def _battery(self) -> BatterySample:
+        return BatterySample(*self.record["battery"][0].tolist())
+
+    @property
+    def _elapsed_us(self) -> int:
+        """How long what moves has been under way [µs]."""
+        return self.record["time_us"].item(0) - self.record["moves_us"].item(0)
 
     def begin(self) -> None:
         """Let what moves set out now; contacts so far are forgotten."""
-        self._moves_us = self.time_us
+        self.record["moves_us"] = self.time_us
+        self._measure_room()
         self.collisions.clear()
 
     def close(self) -> None:
@@ -142,56 +200,179 @@ class Plant:
     @property
     def position(self) -> tuple[float, float, float]:
         """Where the vehicle is, NED [m]."""
-        at = self.motion.item
-        return at(0), at(1), at(2)
+        north, east, down = self._motion[POSITION].tolist()
+        return north, east, down
 
     @property
     def rotor_speeds(self) -> Speeds:
         """Speeds of the rotors, as shares of that at full command, in the order of the motors."""
-        return self._speeds
+        a, b, c, d = self.record["speeds"][0].tolist()
+        return a, b, c, d
+
+    # --- compiled ticks
+
+    @property
+    def compiled(self) -> bool:
+        """Whether compiled ticks move and measure as `step` does."""
+        return (
+            self._sensors.compiled
+            and self._rangefinder is None
+            and self._flow is None
+            and isinstance(self.wind, Wind)
+        )
+
+    def glide(
+        self, controller: Record, ticks: int, truths: Record, flown: Record
+    ) -> tuple[int, int]:
+        """Fly up to so many compiled ticks.
+
+        Args:
+            controller: Record of the flight controller.
+            ticks: How many.
+            truths: (ticks,) log of the aircraft, written.
+            flown: (ticks,) log of the flight controller, written.
+
+        Returns:
+            How many ticks are complete, and the event that ended them (`engine.ticks`).
+        """
+        done = 0
+        if self.record["resting"][0] and controller["demand_kind"][0] != IDLE:
+            self.record["resting"], self.record["room_m"] = 0, -math.inf
+        while True:
+            inertial, compass, barometer, gps = self._sensors.noise
+            told = stretch(
+                *(self.record, self._sensors.record, controller, ticks - done),
+                *(inertial, compass, barometer, gps, self._winds, truths[done:], flown[done:]),
+            )
+            flew, event = told >> EVENT_BITS, told & EVENT_MASK
+            done += flew
+            if not self.record["resting"][0]:
+                self._away = self._away or flew > 0 or event == FUSE
+            if event == NOISE:
+                self._refill()
+            elif event != ROOM:
+                return done, event
+            elif not self._measure_room():
+                if done:
+                    return done, NONE
+                return self.touch(controller, ticks, truths, flown)
+
+    def touch(
+        self, controller: Record, ticks: int, truths: Record, flown: Record
+    ) -> tuple[int, int]:
+        """Fly up to so many ticks in which contacts are possible; as `glide`.
+
+        The body among those of the arena moves the vehicle. It ends after a collision, and when
+        contacts are no longer possible.
+        """
+        record, sensors, before = self.record, self._sensors, len(self.collisions)
+        for k in range(ticks):
+            wind = self._wind_now()
+            pushed = begin_touch(controller, record, flown[k : k + 1], wind)
+            after = self._moved(*pushed)
+            sensors.refill()
+            event = end_touch(
+                *(record, sensors.record, controller, after, wind, bool(self._touching)),
+                *(*sensors.noise, truths[k : k + 1]),
+            )
+            if event == FUSE:
+                return k, FUSE
+            if controller["detected"][0]:
+                return k + 1, DETECTED
+            if len(self.collisions) > before:
+                return k + 1, COLLIDED
+            if event:
+                return k + 1, event
+            if not self._touching and self._measure_room():
+                return k + 1, NONE
+            if controller["demand_kind"][0] == IDLE and self._has_come_to_rest():
+                return k + 1, NONE
+        return ticks, NONE
+
+    def newest(self) -> SensorSample:
+        """Return the newest sample of the compiled sensors."""
+        return self._sensors.newest(self._battery)
+
+    def _refill(self) -> None:
+        self._sensors.refill()
+        at = self.record["noise_at"][0]
+        if isinstance(self.wind, Wind) and at[4] >= len(self._winds):
+            self._winds, at[4] = self.wind.ahead(), 0
+
+    def _wind_now(self) -> Vector:
+        at = self.record["noise_at"][0]
+        if len(self._winds) == 1:
+            return self._winds[0]
+        if at[4] >= len(self._winds):
+            self._refill()
+        at[4] += 1
+        return self._winds[at[4] - 1]
+
+    def _measure_room(self) -> bool:
+        """Measure how far everything is that can be touched; return whether that is far enough."""
+        self.record["resting"] = 0
+        room_m = -math.inf if self._touching else self._room.measure(self._motion, self._elapsed_us)
+        self.record["room_m"] = room_m
+        return room_m > ROOM_M
+
+    # --- ticks by Python
 
     def step(self, controls: ActuatorControls) -> SensorSample:
         """Apply motor commands for one tick and return what the sensors then measure."""
-        body, before, wind = self.body, self.motion, self.wind.step()
-        # An empty battery turns no motor.
-        motors = controls.motors if self.battery_remaining > 0.0 else STOPPED
-        speeds, here, force, torque = actuate(
-            self._speeds, motors, before, wind, self._airframe, self.rotor_lag
-        )
-        self._ticks += 1
-        # Of the count: not every rate has a period of whole microseconds.
-        self.time_us = self._start_us + self._ticks * US_PER_S // self._rate_hz
-        self.motion = body.move(here, force, torque, before, self.time_us - self._moves_us)
-        if body.touch.close or self._touching:
-            self._watch(body.touch, before)
-        self.power_w, self._felt, reading, self.battery_remaining = absorb(
-            before,
-            self.motion,
-            wind,
-            speeds,
-            bool(self._touching),
-            self._felt,
-            self.battery_remaining,
-            self._airframe,
-            self._power,
-            self._pack,
-            self._computer_w,
-            self._tick_s,
-        )
-        self._speeds, self._battery = speeds, BatterySample(*reading)
+        wind = self._wind_now() if isinstance(self.wind, Wind) else self.wind.step()
+        self._move(controls.motors, wind)
         return self.sense()
+
+    def _move(self, motors: Speeds, wind: Vector) -> None:
+        record, stopped = self.record, motors == STOPPED
+        if stopped and record["resting"][0] and record["room_m"][0] > ROOM_M:
+            rest_record(record, wind)
+            return
+        # An empty battery turns no motor.
+        motors = motors if record["charge"][0] > 0.0 else STOPPED
+        after = self._moved(*push_record(record, motors, wind))
+        finish_record(record, after, wind, bool(self._touching))
+        if stopped:
+            self._has_come_to_rest()
+
+    def _moved(self, here: Vec, force: Vec, torque: Vec) -> Vector:
+        """Let the body move for a tick; return the motion after it (16,), and note its contacts."""
+        body, record, before = self.body, self.record, self._motion
+        if self._away:
+            body.follow(before)
+            self._away = False
+        elif record["resting"][0]:
+            body.look_around()
+        ticks, rate_hz = record["ticks"].item(0) + 1, record["rate_hz"].item(0)
+        time_us = record["start_us"].item(0) + ticks * US_PER_S // rate_hz
+        after = body.move(here, force, torque, before, time_us - record["moves_us"].item(0))
+        if body.touch.close or self._touching:
+            self._watch(body.touch, before, time_us)
+        record["room_m"], record["resting"] = -math.inf, 0
+        return after
+
+    def _has_come_to_rest(self) -> bool:
+        """Let the vehicle rest where it stands on the floor alone; return whether it does."""
+        record, motion = self.record, self._motion
+        names = [self.body.names[other] for other in self._touching]
+        if names != [FLOOR] or np.maximum.reduce(record["speeds"][0]) > STILL:
+            return False
+        if np.maximum.reduce(np.abs(motion[[3, 4, 5, 10, 11, 12]])) > STILL:
+            return False
+        room_m = self._room.measure_solids(self._motion, self._elapsed_us)
+        record["resting"], record["room_m"] = room_m > ROOM_M, room_m
+        return room_m > ROOM_M
 
     def sense(self) -> SensorSample:
         """Return a sensor sample of the present state."""
-        sample = self._sensors.sample(self.time_us, self.motion, self._battery)
+        sample = self._sensors.sample(self.time_us, self._motion, self._battery)
         finder, flow = self._rangefinder, self._flow
-        elapsed_us = self.time_us - self._moves_us
         if finder is not None and finder.rate.due(self.time_us):
-            sample = sample._replace(distance=finder.read(self.motion, elapsed_us))
+            sample = sample._replace(distance=finder.read(self.motion, self._elapsed_us))
         if flow is not None:
             flow.pass_tick(self.motion)
             if flow.rate.due(self.time_us):
-                sample = sample._replace(flow=flow.read(self.motion, elapsed_us))
+                sample = sample._replace(flow=flow.read(self.motion, self._elapsed_us))
         return sample
 
     def truth(self) -> Truth:
@@ -222,12 +403,13 @@ class Plant:
             quaternion: Body -> NED.
             rates: Angular velocity FRD [rad/s].
         """
-        self.motion = self.body.put(position, velocity, quaternion, rates)
-        self._touching = frozenset()
+        self._motion[:] = self.body.put(position, velocity, quaternion, rates)
+        self._touching, self._away = frozenset(), False
+        self.record["room_m"] = -math.inf
         self.collisions.clear()
 
-    def _watch(self, touch: Touch, before: Vector) -> None:
-        """Latch every new contact; a contact that lasts is one event."""
+    def _watch(self, touch: Touch, before: Vector, time_us: int) -> None:
+        """Latch every new contact at the end of a tick [µs]; one that lasts is one event."""
         # Contacts flicker: one has ended when the bodies are no longer close.
         touching = touch.pressed | (self._touching & touch.close)
         if touching - self._touching:
@@ -235,5 +417,5 @@ class Plant:
             for other in sorted(touching - self._touching):
                 name = self.body.names[other]
                 if name != FLOOR or speed > REST_SPEED_M_S:
-                    self.collisions.append(Collision(self.time_us, name, speed))
+                    self.collisions.append(Collision(time_us, name, speed))
         self._touching = touching

@@ -7,9 +7,9 @@ import numpy as np
 from airl_mav.arena.geometry import Arena
 from airl_mav.core.frames import Vector
 from airl_mav.profiles.sensors import Rangefinder
+from firmware_sim.engine.kinematics import POSITION, QUATERNION
 from firmware_sim.interfaces import DistanceReading
 from firmware_sim.plant.downward_ray import DownwardRay
-from firmware_sim.plant.kinematics import POSITION, QUATERNION
 from firmware_sim.plant.sensors import Rate, White
 
 VALID, INVALID = 100, 0

@@ -9,10 +9,8 @@ import numpy as np
 
 from airl_mav.core.constants import TICK_S, US_PER_S
 from airl_mav.core.frames import Vector, local_to_geodetic
-from airl_mav.core.kernels import kernel
-from airl_mav.core.location import HOME, MAGNETIC_FIELD_NED
-from airl_mav.profiles.sensors import Barometer, Gps, Magnetometer, Sensors, Vision
-from airl_mav.vehicle.atmosphere import pressure_hpa, temperature_c
+from airl_mav.core.location import HOME
+from airl_mav.profiles.sensors import Sensors, Vision
 from airl_mav.vehicle.rotation import (
     Quat,
     conjugate,
@@ -21,14 +19,18 @@ from airl_mav.vehicle.rotation import (
     rotate,
     yaw_of,
 )
+from firmware_sim.engine.kinematics import POSITION, VELOCITY, quaternion
+from firmware_sim.engine.record import GPS, MAG, PRESSURE, Record, new_aircraft, new_sample
+from firmware_sim.engine.ticks import sense_record
 from firmware_sim.interfaces import BatterySample, GpsFix, Odometry, SensorSample
-from firmware_sim.plant.kinematics import POSITION, VELOCITY, force, quaternion, rates
 
-PA_PER_HPA = 100.0
 GPS_SATELLITES = 12
 
 BLOCK = 128
 """Samples for which noise is drawn at once; the number does not affect the values."""
+
+_WIDTHS = (12, 3, 2, 9)
+"""Numbers of white noise in a sample of accelerometer and gyro, compass, barometer, GPS."""
 
 
 class Rate:
@@ -71,106 +73,6 @@ class White:
         row: Vector = self._rows[self._next]
         self._next += 1
         return row
-
-
-@kernel
-def _feel(
-    row: Vector,
-    noise: Vector,
-    sigma: Vector,
-    accel_bias: Vector,
-    gyro_bias: Vector,
-    accel: Vector,
-    gyro: Vector,
-) -> None:
-    """Write what accelerometer and gyro measure, and let their biases walk.
-
-    Args:
-        row: (16,) the vehicle's motion.
-        noise: (12,) white: of the accelerometer, of the gyro, of their biases (3 each).
-        sigma: (12,) what it is multiplied by.
-        accel_bias: (3,) [m/s²], updated.
-        gyro_bias: (3,) [rad/s], updated.
-        accel: (3,) FRD [m/s²], overwritten.
-        gyro: (3,) FRD [rad/s], overwritten.
-    """
-    felt, turning = force(row), rates(row)
-    for axis in range(3):
-        accel_bias[axis] += sigma[6 + axis] * noise[6 + axis]
-        gyro_bias[axis] += sigma[9 + axis] * noise[9 + axis]
-        accel[axis] = felt[axis] + accel_bias[axis] + sigma[axis] * noise[axis]
-        gyro[axis] = turning[axis] + gyro_bias[axis] + sigma[3 + axis] * noise[3 + axis]
-
-
-@kernel
-def _point(row: Vector, field: Vector, noise: Vector, sigma: float, mag: Vector) -> None:
-    """Write what a magnetometer reads, FRD (3,), in a field NED (3,); noise white (3,)."""
-    x, y, z = rotate(conjugate(quaternion(row)), (field[0], field[1], field[2]))
-    mag[0] = x + sigma * noise[0]
-    mag[1] = y + sigma * noise[1]
-    mag[2] = z + sigma * noise[2]
-
-
-class _Compass:
-    """Magnetometer: white noise."""
-
-    def __init__(self, magnetometer: Magnetometer, rng: np.random.Generator, times: float) -> None:
-        self.rate = Rate(magnetometer.rate_hz)
-        self._sigma = times * magnetometer.noise_gauss
-        self._white = White(rng, 3)
-
-    def read(self, row: Vector) -> Vector:
-        """Return the field FRD [gauss]."""
-        mag = np.empty(3)
-        _point(row, MAGNETIC_FIELD_NED, self._white.draw(), self._sigma, mag)
-        return mag
-
-
-class _Barometer:
-    """Barometer: white noise and a drift that walks."""
-
-    def __init__(self, barometer: Barometer, rng: np.random.Generator, times: float) -> None:
-        self.rate = Rate(barometer.rate_hz)
-        self._noise_pa = times * barometer.noise_pa
-        self._step_pa = times * barometer.drift_pa_sqrt_s / math.sqrt(barometer.rate_hz)
-        self._drift_pa = 0.0
-        self._white = White(rng, 2)
-
-    def read(self, altitude: float) -> float:
-        """Return the static pressure [hPa] at an altitude above mean sea level [m]."""
-        white = self._white.draw()
-        self._drift_pa += self._step_pa * white.item(0)
-        noise_pa = self._noise_pa * white.item(1)
-        return pressure_hpa(altitude) + (self._drift_pa + noise_pa) / PA_PER_HPA
-
-
-class _Gps:
-    """GPS: white noise, and a slowly wandering position error (Gauss-Markov on each axis)."""
-
-    def __init__(self, gps: Gps, rng: np.random.Generator, times: float) -> None:
-        self.rate = Rate(gps.rate_hz)
-        self._gps = gps
-        self._keep = math.exp(-1.0 / (gps.rate_hz * gps.drift_time_constant_s))
-        sigma = gps.drift_m_sqrt_s * math.sqrt(0.5 * gps.drift_time_constant_s)
-        self._drive = times * sigma * math.sqrt(1.0 - self._keep**2)
-        self._error = np.zeros(3)
-        noise = (gps.horizontal_noise_m, gps.horizontal_noise_m, gps.vertical_noise_m)
-        self._position_noise = times * np.array(noise)
-        self._velocity_noise = times * gps.velocity_noise_m_s
-        self._white = White(rng, 9)
-
-    def read(self, row: Vector) -> GpsFix:
-        """Return a fix."""
-        gps, white = self._gps, self._white.draw()
-        self._error = self._keep * self._error + self._drive * white[0:3]
-        position = row[POSITION] + self._error + self._position_noise * white[3:6]
-        return GpsFix(
-            position=local_to_geodetic(position, HOME),
-            velocity_ned=row[VELOCITY] + self._velocity_noise * white[6:9],
-            eph_m=gps.horizontal_noise_m,
-            epv_m=gps.vertical_noise_m,
-            satellites=GPS_SATELLITES,
-        )
 
 
 class _Vision:
@@ -249,6 +151,7 @@ class SensorSuite:
         rng: np.random.Generator,
         tick_s: float = TICK_S,
         times: float = 1.0,
+        record: Record | None = None,
     ) -> None:
         """Switch them on.
 
@@ -258,13 +161,19 @@ class SensorSuite:
             tick_s: Length of a tick [s].
             times: What noise, biases and drifts are multiplied by. What the GPS receiver says of
                 its accuracy stays: nobody is told.
+            record: Of the aircraft, which keeps their state; None = a new one.
         """
-        imu = profile.imu
-        inertial, compass, barometer, gps, vision = rng.spawn(5)
+        self._record = record = new_aircraft() if record is None else record
+        self.record = new_sample()
+        """Newest sample of the compiled sensors."""
+        imu, gps, barometer = profile.imu, profile.gps, profile.barometer
+        self._gps = gps
+        streams = rng.spawn(5)
+        inertial, vision = streams[0], streams[4]
         walk = math.sqrt(tick_s)
         # The profile's noise is that of a sample at the base tick: its density stays.
         white = math.sqrt(TICK_S / tick_s)
-        self._sigma = times * np.repeat(
+        record["imu_sigma"] = times * np.repeat(
             [
                 imu.accel_noise_m_s2 * white,
                 imu.gyro_noise_rad_s * white,
@@ -273,41 +182,79 @@ class SensorSuite:
             ],
             3,
         )
-        self._accel_bias = times * imu.accel_bias_m_s2 * inertial.standard_normal(3)
-        self._gyro_bias = times * imu.gyro_bias_rad_s * inertial.standard_normal(3)
-        self._white = White(inertial, 12)
-        self._compass = _Compass(profile.magnetometer, compass, times)
-        self._barometer = _Barometer(profile.barometer, barometer, times)
-        self._gps = _Gps(profile.gps, gps, times) if profile.gps.fitted else None
-        self._rates = [self._compass.rate, self._barometer.rate]
-        if self._gps is not None:
-            self._rates.append(self._gps.rate)
+        record["accel_bias"] = times * imu.accel_bias_m_s2 * inertial.standard_normal(3)
+        record["gyro_bias"] = times * imu.gyro_bias_rad_s * inertial.standard_normal(3)
+        record["mag_sigma"] = times * profile.magnetometer.noise_gauss
+        record["baro_noise_pa"] = times * barometer.noise_pa
+        record["baro_step_pa"] = times * barometer.drift_pa_sqrt_s / math.sqrt(barometer.rate_hz)
+        keep = math.exp(-1.0 / (gps.rate_hz * gps.drift_time_constant_s))
+        sigma = gps.drift_m_sqrt_s * math.sqrt(0.5 * gps.drift_time_constant_s)
+        record["gps_fitted"], record["gps_keep"] = gps.fitted, keep
+        record["gps_drive"] = times * sigma * math.sqrt(1.0 - keep**2)
+        noise = (gps.horizontal_noise_m, gps.horizontal_noise_m, gps.vertical_noise_m)
+        record["gps_noise_m"] = times * np.array(noise)
+        record["gps_noise_m_s"] = times * gps.velocity_noise_m_s
+        self.record["gps_epv_m"] = gps.vertical_noise_m
+        for name, rate_hz in (
+            ("mag_rate", profile.magnetometer.rate_hz),
+            ("baro_rate", barometer.rate_hz),
+            ("gps_rate", gps.rate_hz),
+        ):
+            record[name] = rate_hz, 0.0, 0.0
+        self._streams = streams[:4]
+        self.noise = [np.zeros((0, width)) for width in _WIDTHS]
+        """White noise of accelerometer and gyro, compass, barometer, GPS: blocks of rows."""
         self._vision = None
         if profile.vision is not None:
             self._vision = _Vision(profile.vision, vision, times)
-            self._rates.append(self._vision.rate)
-        self._slow_us = 0.0
-        """Simulated time before which none of the slower ones is due [µs]."""
+
+    @property
+    def compiled(self) -> bool:
+        """Whether compiled ticks measure all that these sensors do."""
+        return self._vision is None
+
+    def measure(self) -> None:
+        """Measure what compiled ticks measure."""
+        self.refill()
+        sense_record(self._record, self.record, *self.noise)
+
+    def refill(self) -> None:
+        """Draw new blocks of noise where the old ones are used up."""
+        used = self._record["noise_at"][0]
+        for i, rng in enumerate(self._streams):
+            if used[i] >= len(self.noise[i]):
+                self.noise[i], used[i] = rng.standard_normal((BLOCK, _WIDTHS[i])), 0
 
     def sample(self, time_us: int, row: Vector, battery: BatterySample) -> SensorSample:
         """Return what is measured at `time_us` [µs] in motion `row` (16,), `plant.kinematics`."""
-        accel, gyro, noise = np.empty(3), np.empty(3), self._white.draw()
-        _feel(row, noise, self._sigma, self._accel_bias, self._gyro_bias, accel, gyro)
-        altitude = HOME.altitude_m - row.item(2)
-        air = temperature_c(altitude)
-        if time_us < self._slow_us:
-            return SensorSample(time_us, accel, gyro, air, battery)
-        mag = self._compass.read(row) if self._compass.rate.due(time_us) else None
-        pressure = self._barometer.read(altitude) if self._barometer.rate.due(time_us) else None
-        gps = None
-        if self._gps is not None and self._gps.rate.due(time_us):
-            gps = self._gps.read(row)
+        record = self._record
+        record["time_us"], record["motion"] = time_us, row
+        self.measure()
         odometry = None if self._vision is None else self._see(self._vision, time_us, row)
-        self._slow_us = min(rate.next_us for rate in self._rates)
-        if self._vision is not None:
-            self._slow_us = min(self._slow_us, self._vision.told_us)
+        return self.newest(battery)._replace(odometry=odometry)
+
+    def newest(self, battery: BatterySample) -> SensorSample:
+        """Return the newest sample of the record."""
+        fields = self.record[0]
+        measured, gps = fields["measured"], self._gps
+        fix = None
+        if measured & GPS:
+            fix = GpsFix(
+                local_to_geodetic(fields["gps_position"], HOME),
+                fields["gps_velocity"].copy(),
+                eph_m=gps.horizontal_noise_m,
+                epv_m=gps.vertical_noise_m,
+                satellites=GPS_SATELLITES,
+            )
         return SensorSample(
-            time_us, accel, gyro, air, battery, mag, pressure, gps, odometry=odometry
+            int(fields["time_us"]),
+            fields["accel"].copy(),
+            fields["gyro"].copy(),
+            float(fields["temperature_c"]),
+            battery,
+            fields["mag"].copy() if measured & MAG else None,
+            float(fields["pressure_hpa"]) if measured & PRESSURE else None,
+            fix,
         )
 
     @staticmethod

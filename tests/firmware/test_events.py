@@ -10,6 +10,7 @@ import struct
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
 import pytest
 from mavsdk.plugins.action import Action, ActionError
 from mavsdk.plugins.events import Events, EventsError, LogLevel
@@ -374,8 +375,7 @@ def test_a_pilot_who_is_heard_no_more_is_told_by_events_alone() -> None:
 def test_a_sensor_that_falls_silent_is_an_event() -> None:
     found = []
     for kind in (ACCEL, GYRO, MAG, BARO, GPS):
-        watch = SensorWatch(kind)
-        watch._seen_us = 0  # it has measured once
+        watch = SensorWatch(kind, np.zeros(3, np.int64))  # it has measured once, at 0
         message = watch.judge(2 * US_PER_S, flying=True)
         assert message is not None and message.text == f"{kind.name} #0 failed: TIMEOUT!"
         found.append(None if message.event is None else read(message.event)[0])

@@ -103,7 +103,7 @@ def test_moving_obstacles_and_faults_begin_with_the_episode(make: Make) -> None:
         simulation.tick()
     (acted,) = simulation.faults.acted(simulation.time_us)
     assert acted.from_us - simulation.start_us == US_PER_S
-    assert simulation.plant._moves_us == simulation.start_us
+    assert simulation.plant.record["moves_us"][0] == simulation.start_us
 
 
 def test_a_vehicle_that_refuses_to_arm_stays_on_the_ground_and_says_why(make: Make) -> None:

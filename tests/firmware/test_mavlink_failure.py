@@ -120,6 +120,6 @@ def test_a_motor_that_is_off_stops(aloft: Aloft) -> None:
     assert aloft.simulation.plant.position[2] < -1.0
     assert aloft.inject(MOTOR, OFF, 1) == ACCEPTED
     aloft.run(0.5)
-    speeds = aloft.simulation.plant._speeds
+    speeds = aloft.simulation.plant.rotor_speeds
     assert speeds[0] == pytest.approx(0.0, abs=1e-3)
     assert max(speeds[1:]) > 0.1

@@ -8,16 +8,18 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from mavsdk.plugins.log_files import LogFiles
 from mavsdk.plugins.log_streaming import LogStreaming
 from pyulog import ULog
 
+from firmware_sim.engine.record import TRUE_TICK
 from firmware_sim.flight_log.flight_log import FlightLog
 from firmware_sim.flight_log.log_folder import LogFolder
-from firmware_sim.interfaces import Truth
 from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.services.log_transfer import NO_MESSAGE
+from firmware_sim.mavlink.telemetry import flown_of
 from tests.support.kinematic_autopilot import KinematicAutopilot
 from tests.support.mavlink_clients import (
     BOOT_UNIX_US,
@@ -44,12 +46,11 @@ class LoggedAutopilot(KinematicAutopilot):
         if sample is None or self.log.closed:
             return
         estimate = self.state().estimate
-        still = estimate.angular_velocity
-        truth = Truth(
-            sample.time_us, estimate.position, estimate.velocity, estimate.quaternion, still, 0, 1
-        )
-        self.log.before_tick(sample.time_us, lambda: truth)
-        self.log.after_tick(sample, self.state)
+        truths = np.zeros(1, TRUE_TICK)
+        truths["time_us"], truths["charge"] = sample.time_us, 1.0
+        truths["motion"][0, :3], truths["motion"][0, 3:6] = estimate.position, estimate.velocity
+        truths["motion"][0, 6:10] = estimate.quaternion
+        self.log.after_ticks(flown_of(self.state()), truths, self.state())
 
 
 @pytest.fixture

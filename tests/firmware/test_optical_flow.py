@@ -26,13 +26,13 @@ from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.autopilot_state import Result
 from firmware_sim.autopilot.optical_flow import STUCK, OpticalFlow, flow_by_errors
 from firmware_sim.crash_detector import TOUCHDOWN_M_S
+from firmware_sim.engine.kinematics import WIDTH
 from firmware_sim.external.px4 import hil_messages as hil
 from firmware_sim.flight_log import values
 from firmware_sim.interfaces import FlowReading, SensorSample
 from firmware_sim.mavlink.codec import Encoder, layout
-from firmware_sim.mavlink.streams import pose
 from firmware_sim.mavlink.streams.optical_flow import optical_flow_rad
-from firmware_sim.plant.kinematics import WIDTH
+from firmware_sim.mavlink.telemetry import payload
 from firmware_sim.plant.optical_flow import BEST, INVALID, PlantOpticalFlow
 from tests.support import mavlink_clients
 from tests.support.flight_rig import Rig, velocity_setpoint
@@ -212,7 +212,7 @@ def test_a_flight_by_flow_alone() -> None:
     assert math.hypot(*off.tolist()) < 0.6  # of a way of 32 m
     assert np.abs(off).max() < 3.0 * estimate.sigma[:2].max()
     state = rig.ap.state()
-    assert pose.local_position_ned(state) is not None
+    assert payload("LOCAL_POSITION_NED", state) is not None
     assert optical_flow_rad(state) is not None
 
 

@@ -23,9 +23,9 @@ from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import HAS_PYBULLET, Aircraft, PlantName
 from airl_mav.vehicle import wind as wind_module
 from airl_mav.vehicle.wind import Wind
+from firmware_sim.engine.kinematics import FORCE, POSITION, QUATERNION, VELOCITY
 from firmware_sim.interfaces import ActuatorControls, BatterySample, SensorSample
 from firmware_sim.plant import sensors as sensors_module
-from firmware_sim.plant.kinematics import FORCE, POSITION, QUATERNION, VELOCITY
 from firmware_sim.plant.plant import Collision, Plant
 from firmware_sim.plant.sensors import Rate, SensorSuite
 from tests.support.solo import SOLO
@@ -440,7 +440,8 @@ def test_a_soft_touch_down_and_sliding_are_no_collisions(make: PlantMaker) -> No
     run(plant, HOVER, 0.5)
     run(plant, OFF, 1.0)
     # A push, and not `plant.put`: what stands goes on standing.
-    plant.motion = plant.body.put(plant.position, (2.0, 0.0, 0.0))
+    plant.record["motion"] = plant.body.put(plant.position, (2.0, 0.0, 0.0))
+    plant.record["resting"] = 0
     run(plant, OFF, 1.0)
     assert plant.truth().position[0] > 0.1
     assert plant.collisions == []

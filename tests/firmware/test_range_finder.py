@@ -31,7 +31,7 @@ from firmware_sim.external.px4 import hil_messages as hil
 from firmware_sim.flight_log import values
 from firmware_sim.interfaces import DOWNWARD, DistanceReading, SensorSample
 from firmware_sim.mavlink.codec import Encoder
-from firmware_sim.mavlink.streams import distance, pose, status
+from firmware_sim.mavlink.streams import distance, status
 from tests.support import mavlink_clients
 from tests.support.flight_rig import Rig, velocity_setpoint
 
@@ -130,7 +130,7 @@ def test_a_flight_over_a_box() -> None:
     state = rig.ap.state()
     ground, told, down = state.clearance, state.distance, float(state.estimate.position[2])
     assert ground is not None and told is not None and ground.by_range
-    *_, terrain, bottom = pose.altitude(state)
+    terrain, bottom = distance.clearance(state, float(state.estimate.position[2]))
     assert bottom == ground.dist_bottom_m and terrain == -down - ground.dist_bottom_m
     sent = distance.distance_sensor(state)
     assert sent is not None
@@ -160,7 +160,8 @@ def test_ranges_that_are_not_fused_tell_no_ground() -> None:
     rig = indoors(EKF2_RNG_CTRL=0)
     rig.take_off(2.0)
     assert not clearance(rig).valid and not finder(rig).tells_ground
-    *_, terrain, bottom = pose.altitude(rig.ap.state())
+    state = rig.ap.state()
+    terrain, bottom = distance.clearance(state, float(state.estimate.position[2]))
     assert math.isnan(terrain) and math.isnan(bottom)
     assert distance.distance_sensor(rig.ap.state()) is not None
 

@@ -17,8 +17,8 @@ from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.sensors import Rangefinder
 from airl_mav.profiles.vehicle import load_vehicle
+from firmware_sim.engine.kinematics import POSITION, QUATERNION
 from firmware_sim.interfaces import ActuatorControls
-from firmware_sim.plant.kinematics import POSITION, QUATERNION
 from firmware_sim.plant.plant import Plant
 from firmware_sim.plant.rangefinder import PlantRangefinder
 

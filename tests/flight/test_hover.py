@@ -33,8 +33,8 @@ def hover(rig: Rig) -> Hover:
     positions, speeds, errors, tilts = [], [], [], []
     for _ in range(round(SECONDS * US_PER_S / (EVERY * TICK_US))):
         rig.run((EVERY - 1) * TICK_US / US_PER_S)
-        truth = rig.truth
         rig.tick()
+        truth = rig.truth
         estimate = rig.ap.state().estimate
         assert estimate.time_us == truth.time_us
         really = Rotation.from_quat(quat_wxyz_to_xyzw(truth.quaternion))

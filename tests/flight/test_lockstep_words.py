@@ -178,7 +178,7 @@ def partner(mate: Mate, **settings: Any) -> Iterator[TokenPartner]:
         wired(mate) as (wire, _),
         closing(TokenPartner(wire, TokenCamera(server, 0), **settings)) as made,
     ):
-        made.send(heartbeat())
+        made.send([heartbeat()])
         yield made
 
 
@@ -246,7 +246,7 @@ def test_nothing_but_heartbeats_before_the_companion_is_there() -> None:
     pings = [encoder.pack(dialect.MAVLink_ping_message(i, i, 0, 0)) for i in range(100)]
     with partner(mate) as vehicle:
         for ping in pings:
-            vehicle.send(ping)
+            vehicle.send([ping])
         waiter = threading.Thread(target=vehicle.turn, args=(NOW_US, lambda _: None))
         waiter.start()
         time.sleep(0.3)  # it comes late: several heartbeats lie in its socket
@@ -274,7 +274,7 @@ def test_answers_are_not_repeated() -> None:
         partner(mate, patience_s=0.5) as vehicle,
         pytest.raises(LockstepError, match="the companion is gone"),
     ):
-        vehicle.turn(NOW_US, lambda _: vehicle.send(answer))
+        vehicle.turn(NOW_US, lambda _: vehicle.send([answer]))
     kinds = mate.kinds()
     assert kinds.count("F1 100000 -1") >= 3
     assert kinds.count("COMMAND_ACK") == 1
@@ -363,14 +363,14 @@ def test_who_gave_the_first_turn_back_is_the_companion() -> None:
         closing(TokenPartner(wire, TokenCamera(NoCamera(), 0))) as made,
         closing(Stranger(vehicle)) as other,
     ):
-        made.send(heartbeat())
+        made.send([heartbeat()])
         assert made.turn(NOW_US, lambda _: None).wake_us == 200_000
         for text in ("D2 end", "D2 soon", "D99 900000", "P2 navigating"):
             other.say(text)
         other.send(land())
         other.socket.sendto(b"\xfd" * 300, vehicle)
         assert made.turn(200_000, lambda frame: handled.append(frame)).wake_us == 300_000
-        made.send(heartbeat())
+        made.send([heartbeat()])
         assert other.hears_nothing()
         assert made.turn(300_000, lambda frame: handled.append(frame)).wake_us == 400_000
         assert wire.foreign == 6
@@ -394,7 +394,7 @@ def test_turns_pass_signed(stored: StoredSigning) -> None:
         wired(mate, stored) as (wire, _),
         closing(TokenPartner(wire, TokenCamera(NoCamera(), 0))) as made,
     ):
-        made.send(heartbeat() + b"".join(pings))
+        made.send([heartbeat(), *pings])
         assert made.turn(NOW_US, lambda _: None).wake_us == 200_000
         assert made.turn(200_000, lambda _: None).wake_us is None
         assert wire.refused == 0
@@ -412,7 +412,7 @@ def test_without_the_key_no_turn_is_given_back(key: bytes | None, stored: Stored
         closing(TokenPartner(wire, TokenCamera(NoCamera(), 0), broken_off=stop.is_set)) as made,
         closing(Stranger(vehicle, key)) as other,
     ):
-        made.send(heartbeat())
+        made.send([heartbeat()])
         other.say("D1 200000 0")
         other.send(land())
         other.send(dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))

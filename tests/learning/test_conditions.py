@@ -90,7 +90,7 @@ def test_a_simulation_draws_what_the_twin_draws() -> None:
         assert isinstance(plant.body, BulletBody)
         body = pybullet.getDynamicsInfo(plant.body.number, -1, plant.body.world.number)
         row = twin.fleet.airframe[0]
-        assert row.tolist() == list(plant._airframe)
+        assert row.tolist() == list(plant.record["airframe"][0])
         assert body[0] == row[0] != QUAD.body.mass_kg
         np.testing.assert_allclose(body[2], row[1:4], rtol=1e-12)
         assert np.array_equal(twin._winds._air[0, 0], plant.wind.step())

@@ -75,7 +75,7 @@ class PlantPilot:
         self.energy = 0.0
         self.plant.put((0.0, 0.0, -altitude_m))
         a = airframe
-        self.plant._speeds = (math.sqrt(a.mass * 9.80665 / (4 * a.thrust_max)),) * 4
+        self.plant.record["speeds"] = math.sqrt(a.mass * 9.80665 / (4 * a.thrust_max))
         self.memory = new_memory()
         trim_for_hover(self.memory, a.mass * 9.80665 / (4 * a.thrust_max), VEHICLE.gains)
         self.time_us, self.repeat_us = 0, 0

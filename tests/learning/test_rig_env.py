@@ -95,7 +95,7 @@ def test_the_plant_s_cameras_take_the_same_images(rig: Path, arena: str) -> None
         plant = SimulatedCamera(
             *(env.camera, world, 0, noise, seed, "raycast", env.vehicle.cameras)
         )
-        taken = {"": plant._main, **plant._further}
+        taken = plant._eyes
         twin = {"": env.cameras._main, **env.cameras.further}
         assert taken.keys() == twin.keys() == {"", "down", "left", "right"}
         for name, eye in taken.items():

@@ -25,6 +25,7 @@ from firmware_sim.mavlink.services import commands, handle, peers
 from firmware_sim.mavlink.services.command import Command
 from firmware_sim.mavlink.services.context import Context, for_vehicle, sender
 from firmware_sim.mavlink.streams import BUILDERS, Builder, status
+from firmware_sim.mavlink.telemetry import context_of, flown_of
 from firmware_sim.mavlink.texts import TextEncoder
 from tests.support.ardupilot_copter import LAND, STABILIZE, Copter
 
@@ -54,17 +55,13 @@ class Manners:
 
     def __init__(self, copter: Copter, endpoints: list[UdpEndpoint]) -> None:
         self.copter = copter
-        builders: dict[str, Builder] = {
+        builders: dict[str, Builder | None] = {
             **BUILDERS,
             "TIMESYNC": peers.timesync_request,
             "HEARTBEAT": self._heartbeat,
             "SYS_STATUS": self._sys_status,
             "EXTENDED_SYS_STATE": lambda state: (3, _LANDED[state.status.landed]),
             "AUTOPILOT_VERSION": _version,
-            **{
-                name: self._with_position(BUILDERS[name])
-                for name in ("LOCAL_POSITION_NED", "GLOBAL_POSITION_INT")
-            },
         }
         self._links = [
             Link(LinkConfig(f"serial{n}", endpoint, _RATES_HZ), builders)
@@ -84,9 +81,13 @@ class Manners:
         for link in self._links:
             for message in link.receive():
                 self._take(message, link)
-            due = link.scheduler.due(copter.time_us)
+            due, state = link.scheduler.due(copter.time_us), copter.inner.state()
+            flown, context = flown_of(state), context_of(state)
+            if not copter.position_ok:
+                flown["healthy"], context[:3] = 0, np.nan
+            link.stream_fast(flown, np.array([copter.time_us]), context, 16)
             if due:
-                link.stream_due(due, copter.inner.state(), {})
+                link.stream_due(due, state, {})
             self._report_ekf(link)
             link.flush()
 
@@ -127,9 +128,6 @@ class Manners:
             link.stream(
                 ardupilotmega.MAVLink_ekf_status_report_message(flags, 0.0, 0.0, 0.0, 0.0, 0.0)
             )
-
-    def _with_position(self, builder: Builder) -> Builder:
-        return lambda state: builder(state) if self.copter.position_ok else None
 
     # --- what is taken
 

@@ -340,7 +340,7 @@ class KinematicAutopilot:
             angular_velocity=np.array([0.0, 0.0, self.yaw_rate]),
             gyro_bias=np.array([0.001, 0.002, 0.003]),
             accel_bias=np.array([0.01, 0.02, 0.03]),
-            sigma=np.arange(1.0, 16.0) / 100.0,
+            sigma=np.arange(1.0, 17.0) / 100.0,
             innovation_ratio=np.array([0.1, 0.2, 0.3, 0.4]),
             healthy=self.arming is not Arming.BOOT,
         )

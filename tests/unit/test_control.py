@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation
 
 from airl_mav.control.attitude import attitude_setpoint, rate_setpoint
 from airl_mav.control.cascade import Output, cascade_tick, filters
-from airl_mav.control.controller import Controller
 from airl_mav.control.demand import Demand
 from airl_mav.control.gains import Gains, pack, unpack
 from airl_mav.control.low_pass import Biquad, butterworth, filtered, settled, weight
@@ -30,6 +29,7 @@ from airl_mav.core.constants import DEG, GRAVITY_M_S2, TICK_S
 from airl_mav.core.frames import quat_wxyz_to_xyzw, wrap_pi
 from airl_mav.vehicle.rotation import Quat, Vec
 from firmware_sim.autopilot.parameter_store import Parameters
+from firmware_sim.engine.controller import Controller
 
 GAINS = Gains.from_parameters(Parameters({"MPC_THR_HOVER": 0.52}).__getitem__)
 FILTERS = filters(GAINS, TICK_S)
@@ -629,7 +629,7 @@ def test_gains_cross_over_whole() -> None:
 def test_the_controller_is_the_cascade_tick(
     position: Vec, velocity: Vec, q: Quat, omega: Vec, p_sp: Vec, v_sp: Vec, yaw: float
 ) -> None:
-    controller, memory = Controller(GAINS, TICK_S), new_memory()
+    controller, memory = Controller(GAINS), new_memory()
     state = np.array([*position, *velocity, *q, *omega, 7.0, 8.0])
     for demand in (Demand(p_sp, NAN3, yaw, NAN), Demand(NAN3, v_sp, NAN, 1.0)):
         out = cascade_tick(position, velocity, q, omega, demand, memory, GAINS, FILTERS, TICK_S)
@@ -643,7 +643,7 @@ def test_the_controller_is_the_cascade_tick(
 
 
 def test_a_controller_at_rest_winds_nothing_up() -> None:
-    controller, memory = Controller(GAINS, TICK_S), new_memory()
+    controller, memory = Controller(GAINS), new_memory()
     state = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     demand = Demand(NAN3, (1.0, 2.0, 0.5), 0.4, NAN)
     for _ in range(50):
@@ -664,7 +664,7 @@ def test_a_controller_at_rest_winds_nothing_up() -> None:
 
 
 def test_a_controller_takes_other_gains() -> None:
-    one, two = Controller(GAINS, TICK_S), Controller(GAINS, TICK_S)
+    one, two = Controller(GAINS), Controller(GAINS)
     state = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     two.set_gains(GAINS._replace(hover_thrust=0.4))
     assert one.fly(state, hover()) == pytest.approx((0.52,) * 4)

@@ -7,11 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from airl_mav.control.controller import Controller
 from airl_mav.control.demand import AttitudeDemand, Demand, RateDemand, TrajectoryDemand
 from airl_mav.control.gains import Gains
-from airl_mav.core.constants import GRAVITY_M_S2, TICK_S
+from airl_mav.core.constants import GRAVITY_M_S2
 from airl_mav.profiles.parameters import flown_values
+from firmware_sim.engine.controller import Controller
 
 GAINS = Gains.from_parameters(flown_values({}).__getitem__)
 NAN3 = (math.nan, math.nan, math.nan)
@@ -26,7 +26,7 @@ def at_rest() -> np.ndarray:
 
 
 def controller() -> Controller:
-    return Controller(GAINS, TICK_S)
+    return Controller(GAINS)
 
 
 def test_without_an_acceleration_a_trajectory_is_flown_as_position_and_velocity() -> None:

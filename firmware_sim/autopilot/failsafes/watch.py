@@ -83,7 +83,7 @@ class Watch:
         self._value = value
         self._estimator = estimator
         self.settings = WatchSettings.read(value)
-        self.sensors = SensorMonitor()
+        self.sensors = SensorMonitor(estimator.record["watch"][0])
         """The sensors, watched."""
         self.attitude = AttitudeFailure()
         """The failure detector."""

@@ -114,6 +114,11 @@ class FlightMode(Protocol):
         return False
 
     @property
+    def is_steady(self) -> bool:
+        """Whether the demand stays the same until another setpoint or request arrives."""
+        return False
+
+    @property
     def destination(self) -> Vec | None:
         """Where an automatic mode is going, local NED [m]; None in all other modes."""
         return None

@@ -63,6 +63,14 @@ class Offboard(FlightMode):
             return True
         return demand.velocity[2] < -CLIMBS_M_S or demand.position[2] < above
 
+    @property
+    def is_steady(self) -> bool:
+        """Whether the setpoint says all that is flown, and another kind is not waited for."""
+        newest = self._context.setpoint
+        if newest is None or type(newest) is not self._kind:
+            return False
+        return not isinstance(newest, RateDemand) or not math.isnan(newest.rates[2])
+
     def enter(self, state: Vector, _request: Request | None, /) -> None:
         """Begin."""
         self._waiting.enter(state, None)

@@ -29,22 +29,22 @@ Builder = Callable[[AutopilotState], "Values | None"]
 """Returns one message's fields, in the order of its definition, from a snapshot; None = there is
 nothing to say yet. Plain values, because message objects would cost more than all the rest."""
 
-BUILDERS: Mapping[str, Builder] = MappingProxyType(
+BUILDERS: Mapping[str, Builder | None] = MappingProxyType(
     {
         **SILENT,
         "HEARTBEAT": status.heartbeat,
-        "ATTITUDE": pose.attitude,
-        "ATTITUDE_QUATERNION": pose.attitude_quaternion,
-        "LOCAL_POSITION_NED": pose.local_position_ned,
-        "ODOMETRY": pose.odometry,
-        "GLOBAL_POSITION_INT": pose.global_position_int,
-        "HIGHRES_IMU": sensors.highres_imu,
-        "ALTITUDE": pose.altitude,
-        "ATTITUDE_TARGET": pose.attitude_target,
-        "POSITION_TARGET_LOCAL_NED": pose.position_target_local_ned,
+        "ATTITUDE": None,
+        "ATTITUDE_QUATERNION": None,
+        "LOCAL_POSITION_NED": None,
+        "ODOMETRY": None,
+        "GLOBAL_POSITION_INT": None,
+        "HIGHRES_IMU": None,
+        "ALTITUDE": None,
+        "ATTITUDE_TARGET": None,
+        "POSITION_TARGET_LOCAL_NED": None,
         "POSITION_TARGET_GLOBAL_INT": pose.position_target_global_int,
-        "SERVO_OUTPUT_RAW": actuators.servo_output_raw,
-        "VFR_HUD": pose.vfr_hud,
+        "SERVO_OUTPUT_RAW": None,
+        "VFR_HUD": None,
         "GPS_RAW_INT": sensors.gps_raw_int,
         "EXTENDED_SYS_STATE": status.extended_sys_state,
         "SYS_STATUS": status.sys_status,
@@ -73,4 +73,5 @@ BUILDERS: Mapping[str, Builder] = MappingProxyType(
         "OPTICAL_FLOW_RAD": optical_flow.optical_flow_rad,
     }
 )
-"""Streams that need the snapshot only; the server adds those that need more."""
+"""Streams that need the snapshot only; the server adds those that need more. None:
+compiled code packs it (`telemetry`)."""

@@ -22,12 +22,6 @@ _FIRST_ESC = 0
 _ESCS = 4
 
 
-def servo_output_raw(state: AutopilotState) -> Values:
-    """Motor pulse widths [µs] of outputs 1..4: 1000..2000 armed, 900 disarmed, as all others."""
-    port = 0
-    return state.time_us & units.UINT32_MAX, port, *_outputs(state)
-
-
 def actuator_output_status(state: AutopilotState) -> Values:
     """The same pulse widths as an array of 16 outputs in use."""
     return state.time_us, _OUTPUTS, *_outputs(state), *(0,) * (_OUTPUT_FIELDS - _OUTPUTS)

@@ -6,14 +6,10 @@ import math
 from collections.abc import Callable
 
 from airl_mav.core.constants import GRAVITY_M_S2
-from airl_mav.vehicle import atmosphere
 from firmware_sim.autopilot.autopilot_state import AutopilotState
 from firmware_sim.autopilot.port import ParameterStore
 from firmware_sim.mavlink.codec import Values, dialect
 from firmware_sim.mavlink.streams import units
-
-_IMU_FIELDS = 0b1_1011_1111_1111
-"""HIGHRES_IMU_UPDATED_FLAGS: all but differential pressure."""
 
 _NO_AIRSPEED = 0.0
 """Differential pressure: there is no such sensor."""
@@ -27,22 +23,6 @@ _CHARGE_WARNINGS = (
     ("BAT_EMERGEN_THR", dialect.MAV_BATTERY_CHARGE_STATE_EMERGENCY),
 )
 """Threshold parameters, from the highest to the lowest."""
-
-
-def highres_imu(state: AutopilotState) -> Values:
-    """Newest IMU sample with the estimated biases removed, as PX4 sends it; mag and baro raw."""
-    estimate = state.estimate
-    return (
-        state.time_us,
-        *(state.accel - estimate.accel_bias).tolist(),
-        *(state.gyro - estimate.gyro_bias).tolist(),
-        *state.mag.tolist(),
-        state.pressure_hpa,
-        _NO_AIRSPEED,
-        atmosphere.altitude_m(state.pressure_hpa),
-        state.temperature_c,
-        _IMU_FIELDS,
-    )
 
 
 def scaled_imu(state: AutopilotState) -> Values:

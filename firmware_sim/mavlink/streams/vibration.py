@@ -9,7 +9,7 @@ import numpy as np
 from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S
 from airl_mav.core.kernels import kernel
 from firmware_sim.autopilot.autopilot_state import AutopilotState, Vector
-from firmware_sim.interfaces import SensorSample
+from firmware_sim.engine.record import Record
 from firmware_sim.mavlink.codec import Values
 
 _OLD, _NEW = 0.99, 0.01
@@ -34,9 +34,9 @@ class VibrationMeter:
         self._memory = np.zeros(_SIZE)
         self._memory[_LAST_US] = math.nan
 
-    def update(self, sample: SensorSample) -> None:
-        """Take in the newest sample; call once per tick."""
-        _update(self._memory, sample.time_us, sample.gyro, sample.accel)
+    def update(self, flown: Record) -> None:
+        """Take in the samples of ticks (n,), each once (`engine.record.FLOWN_TICK`)."""
+        _update(self._memory, flown)
 
     def message(self, state: AutopilotState) -> Values:
         """Return VIBRATION; there is one accelerometer."""
@@ -46,7 +46,14 @@ class VibrationMeter:
 
 
 @kernel
-def _update(memory: Vector, time_us: int, gyro: Vector, accel: Vector) -> None:
+def _update(memory: Vector, flown: Record) -> None:
+    """Filter the samples of ticks (n,) into `memory` (11,)."""
+    for k in range(len(flown)):
+        _filter(memory, flown[k].time_us, flown[k].gyro, flown[k].accel)
+
+
+@kernel
+def _filter(memory: Vector, time_us: int, gyro: Vector, accel: Vector) -> None:
     """Filter one sample into `memory` (11,); gyro (3,) FRD [rad/s], accel (3,) FRD [m/s²]."""
     clipped = False
     last_gyro, last_accel = memory[_LAST_GYRO:_LAST_ACCEL], memory[_LAST_ACCEL:_SIZE]

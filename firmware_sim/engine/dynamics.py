@@ -17,7 +17,7 @@ from airl_mav.vehicle.power import (
 from airl_mav.vehicle.rigid_body import drag_force
 from airl_mav.vehicle.rotation import Vec, rotate
 from airl_mav.vehicle.rotor import settle, wrench
-from firmware_sim.plant.kinematics import quaternion, rates, velocity
+from firmware_sim.engine.kinematics import quaternion, rates, velocity
 
 Speeds = tuple[float, float, float, float]
 """Of the rotors, as fractions of the speed at full command."""

@@ -1,0 +1,1 @@
+"""One vehicle as two records, and the compiled ticks that advance them."""

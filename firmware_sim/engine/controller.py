@@ -1,0 +1,130 @@
+"""The control loops of a flight controller's record."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from airl_mav.control.demand import AnyDemand, AttitudeDemand, Demand, TrajectoryDemand
+from airl_mav.control.gains import Gains, pack
+from airl_mav.control.low_pass import butterworth
+from airl_mav.control.memory import reset_integrals, settle_gyro_filter, ticks_to_motors
+from airl_mav.control.mixer import Motors
+from airl_mav.core.constants import TICK_S
+from airl_mav.core.frames import Vector
+from firmware_sim.engine.record import (
+    ATTITUDE,
+    IDLE,
+    POSITION,
+    RATES,
+    TRAJECTORY,
+    Record,
+    new_controller,
+)
+from firmware_sim.engine.ticks import control_record
+
+_ATTITUDE, _RATES, _VELOCITY, _THRUST = 0, 4, 7, 10
+"""Layout of `output`."""
+
+
+class ControlSetpoints(NamedTuple):
+    """The setpoints of the cascade's loops."""
+
+    attitude: Vector
+    """(4,) body -> NED."""
+    rates: Vector
+    """(3,) FRD [rad/s]."""
+    velocity: Vector
+    """(3,) after limits, NED [m/s]."""
+    thrust: float
+    """Collective 0..1."""
+
+
+class Controller:
+    """Gains, demand and setpoints of the cascade in a flight controller's record."""
+
+    def __init__(self, gains: Gains, record: Record | None = None) -> None:
+        """Start at rest, in the record of a flight controller; None = in a new one."""
+        self._record = record = new_controller() if record is None else record
+        self._demand: AnyDemand | None = None
+        self._wanted, self._output = record["demand"][0], record["output"][0]
+        self._memory, self._motors = record["memory"][0], record["motors"][0]
+        self._gyro_cutoff_hz = gains.gyro_cutoff_hz
+        record["gains"] = pack(gains)
+        self.rest()
+
+    def set_gains(self, gains: Gains) -> None:
+        """Change the gains in flight."""
+        cutoff_hz = gains.gyro_cutoff_hz
+        if cutoff_hz != self._gyro_cutoff_hz:
+            # The delay elements are scaled by the cut-off: left as they are, a much higher one
+            # would multiply the measured rates.
+            settle_gyro_filter(self._memory, butterworth(cutoff_hz, TICK_S))
+            self._gyro_cutoff_hz = cutoff_hz
+        self._record["gains"] = pack(gains)
+
+    def command(self, demand: AnyDemand | None) -> None:
+        """Take what the coming ticks fly; None = stop the motors."""
+        if demand is self._demand:
+            return
+        self._demand, record, wanted = demand, self._record, self._wanted
+        if demand is None:
+            record["demand_kind"] = IDLE
+            self._motors[:] = 0.0
+            self.rest()
+        elif isinstance(demand, Demand):
+            record["demand_kind"] = POSITION
+            wanted[:3], wanted[3:6], wanted[6], wanted[7] = demand
+        elif isinstance(demand, TrajectoryDemand):
+            record["demand_kind"] = TRAJECTORY
+            wanted[:3], wanted[3:6], wanted[6:9], wanted[9], wanted[10] = demand
+        elif isinstance(demand, AttitudeDemand):
+            record["demand_kind"] = ATTITUDE
+            wanted[:4], wanted[4], wanted[5] = demand
+        else:
+            record["demand_kind"] = RATES
+            wanted[:3], wanted[3] = demand
+
+    def fly(self, state: Vector, demand: AnyDemand) -> Motors:
+        """Run one tick; return the motor commands 0..1.
+
+        `state` begins with position NED [m], velocity NED [m/s], attitude body -> NED and body
+        rates FRD [rad/s]: 13 floats.
+        """
+        self._record["state"][0, :13] = state[:13]
+        self.command(demand)
+        control_record(self._record)
+        return self.motors
+
+    def rest(self) -> None:
+        """Reset while the motors are stopped: no integrator may wind up, and there is no output."""
+        reset_integrals(self._memory)
+        self._output[:] = 0.0
+        self._output[_ATTITUDE] = 1.0
+
+    @property
+    def motors(self) -> Motors:
+        """Newest motor commands 0..1."""
+        a, b, c, d = self._motors.tolist()
+        return a, b, c, d
+
+    @property
+    def ticks_to_motors(self) -> int:
+        """After how many more ticks the motors reflect what is demanded in the next one."""
+        return ticks_to_motors(self._memory)
+
+    @property
+    def thrust(self) -> float:
+        """Collective that is commanded, 0..1."""
+        return self._output.item(_THRUST)
+
+    @property
+    def descending(self) -> bool:
+        """Whether the velocity setpoint points down, or nothing controls the velocity."""
+        return not self._output.item(_VELOCITY + 2) <= 0.0
+
+    def setpoints(self) -> ControlSetpoints:
+        """Return a copy of the setpoints of the newest tick."""
+        row = self._output.copy()
+        return ControlSetpoints(
+            row[_ATTITUDE:_RATES], row[_RATES:_VELOCITY], row[_VELOCITY:_THRUST], row.item(_THRUST)
+        )

@@ -1,0 +1,241 @@
+"""The state of one vehicle as records: aircraft, sample of its sensors, flight controller.
+
+A record is an array of one element of a structured dtype. Compiled code takes it in one argument;
+Python reads and writes its fields as views. A copy of the records is a snapshot of the vehicle.
+The flight controller sees the sample alone, never the true state.
+"""
+
+from __future__ import annotations
+
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.control.gains import Gains
+from airl_mav.control.memory import MEMORY_SIZE
+from airl_mav.vehicle.airframe import Airframe
+from airl_mav.vehicle.power import PowerModel
+from firmware_sim.autopilot.consistency import LOOK_BACK
+from firmware_sim.autopilot.error_state import N_STATES, ROW_SIZE
+from firmware_sim.autopilot.turned_motion import WINDOW
+from firmware_sim.autopilot.yaw_estimator import LONGEST, MODEL_SIZE, N_MODELS, SHARED_SIZE
+from firmware_sim.engine.kinematics import WIDTH
+
+Record = NDArray[Any]
+"""(1,) of a structured dtype."""
+
+Fields: TypeAlias = Any
+"""The element of a record in compiled code, with a name for each field."""
+
+MAG, PRESSURE, GPS = 1, 2, 4
+"""Bits of `measured`: which of the slower sensors have a new sample in this tick."""
+
+IDLE, POSITION, TRAJECTORY, ATTITUDE, RATES = -1, 0, 1, 2, 3
+"""Values of `demand_kind`: motors stopped, or the kind of demand (`control.demand`)."""
+
+OFF, TRUSTED, SUSPECT = 0, 1, 2
+"""Values of `compass` and `gps`; Python judges every sample of a suspect one."""
+
+NOTHING, LIFT_OFF, LANDING = 0, 1, 2
+"""Values of `detecting`."""
+
+DEMAND_SIZE = 11
+"""Numbers in the largest demand."""
+
+OUTPUT_SIZE = 11
+"""Setpoints of the control loops: attitude (4), rates (3), velocity (3), thrust."""
+
+SEEN, CHANGED, FIRST, WATCHES = 0, 1, 2, 5
+"""Columns of `watch`, and its rows: gyro, accelerometer, compass, barometer, GPS. Times [µs] of the
+newest sample, of the newest that differs from the one before, of the first; -1 = none."""
+
+GYRO_ROW, ACCEL_ROW, MAG_ROW, BARO_ROW, GPS_ROW = range(WATCHES)
+
+_F, _I = np.float64, np.int64
+
+AIRCRAFT = np.dtype(
+    [
+        # Constants.
+        ("airframe", _F, len(Airframe._fields)),
+        ("power_model", _F, len(PowerModel._fields)),
+        ("pack", _F, 4),
+        ("rotor_lag", _F),
+        ("computer_w", _F),
+        ("tick_s", _F),
+        ("rate_hz", _I),
+        ("start_us", _I),
+        ("moves_us", _I),
+        ("closing_m_s", _F),  # greatest speed of an obstacle
+        # True state.
+        ("ticks", _I),
+        ("time_us", _I),
+        ("motion", _F, WIDTH),
+        ("speeds", _F, 4),
+        ("acceleration", _F, 3),  # as the power model takes it
+        ("charge", _F),
+        ("power_w", _F),
+        ("battery", _F, 4),  # voltage [V], current [A], charge used [mAh], charge left 0..1
+        ("room_m", _F),  # nothing that can be touched is nearer, but for the floor at rest
+        ("resting", _I),  # 1 = stands on the floor, motors and rotors stopped
+        # Sensors: noise, biases, schedules.
+        ("imu_sigma", _F, 12),
+        ("accel_bias", _F, 3),
+        ("gyro_bias", _F, 3),
+        ("mag_sigma", _F),
+        ("baro_noise_pa", _F),
+        ("baro_step_pa", _F),
+        ("baro_drift_pa", _F),
+        ("gps_fitted", _I),
+        ("gps_keep", _F),
+        ("gps_drive", _F),
+        ("gps_error", _F, 3),
+        ("gps_noise_m", _F, 3),
+        ("gps_noise_m_s", _F),
+        ("mag_rate", _F, 3),  # rate [Hz], next sample [µs], number of its period; as those below
+        ("baro_rate", _F, 3),
+        ("gps_rate", _F, 3),
+        ("noise_at", _I, 5),  # next unused row of each block of noise
+    ],
+    align=True,
+)
+"""Body, rotors, battery and sensors. SI units, NED and FRD, angles in radians."""
+
+SAMPLE = np.dtype(
+    [
+        ("time_us", _I),
+        ("measured", _I),
+        ("accel", _F, 3),
+        ("gyro", _F, 3),
+        ("mag", _F, 3),
+        ("pressure_hpa", _F),
+        ("temperature_c", _F),
+        ("gps_position", _F, 3),  # NED [m]
+        ("gps_velocity", _F, 3),
+        ("gps_epv_m", _F),
+    ],
+    align=True,
+)
+"""The newest sample of each sensor: all that a flight controller learns of the aircraft."""
+
+CONTROLLER = np.dtype(
+    [
+        # The newest samples.
+        ("time_us", _I),
+        ("left", _I),  # what of the newest tick is left to fuse, as `ticks.estimate` returns it
+        ("accel", _F, 3),
+        ("gyro", _F, 3),
+        ("mag", _F, 3),
+        ("pressure_hpa", _F),
+        ("temperature_c", _F),
+        ("gps_position", _F, 3),
+        ("gps_velocity", _F, 3),
+        ("watch", _I, (WATCHES, 3)),
+        # Estimator.
+        ("state", _F, ROW_SIZE),
+        ("covariance", _F, (N_STATES, N_STATES)),
+        ("transition", _F, (N_STATES, N_STATES)),
+        ("process_noise", _F, N_STATES),
+        ("healthy", _I),
+        ("baro_origin_m", _F),
+        ("baro_variance", _F),
+        ("baro_fused_us", _I),
+        ("heading_variance", _F),
+        ("heading_fused_us", _I),
+        ("flying", _I),
+        ("compass", _I),  # OFF, TRUSTED or SUSPECT
+        ("gps", _I),  # the same
+        ("origin", _F, 3),  # latitude, longitude [deg], altitude [m]; NaN = not known
+        ("gps_variance", _F, 2),  # position, velocity
+        ("gps_horizontal_us", _I),
+        ("gps_vertical_us", _I),
+        ("gps_horizontal_h", _F, (4, N_STATES)),
+        ("gps_vertical_h", _F, (2, N_STATES)),
+        ("innovation4", _F, 4),
+        ("variance4", _F, 4),
+        ("innovation2", _F, 2),
+        ("variance2", _F, 2),
+        ("velocity_noise", _F),  # variance of GPS velocities, as a share of what it should be
+        ("velocity_before", _F, 3),  # deviations of the newest fix; NaN = none
+        ("accelerations", _F, (LOOK_BACK, 3)),  # of the newest fixes
+        ("fixes", _I),
+        ("felt_motion", _F, (WINDOW, 2)),  # as `turned_motion`
+        ("seen_motion", _F, (WINDOW, 2)),
+        ("motions", _I),
+        ("motion_variance", _F),
+        ("baro_h", _F, (1, N_STATES)),
+        ("heading_h", _F, (1, N_STATES)),
+        ("innovation", _F, 1),
+        ("variance", _F, 1),
+        ("yaw_models", _F, (N_MODELS, MODEL_SIZE)),
+        ("yaw_shared", _F, SHARED_SIZE),
+        ("yaw_gyro", _F, 3 * LONGEST),
+        ("yaw_accel", _F, 3 * LONGEST),
+        ("yaw_count", _I),
+        # Control.
+        ("gains", _F, len(Gains._fields)),
+        ("memory", _F, MEMORY_SIZE),
+        ("demand_kind", _I),
+        ("demand", _F, DEMAND_SIZE),
+        ("output", _F, OUTPUT_SIZE),
+        ("motors", _F, 4),
+        # Land detector.
+        ("detecting", _I),  # NOTHING, LIFT_OFF or LANDING
+        ("detected", _I),  # 1 = it was detected in the newest tick
+        ("land", _F, 6),  # thresholds, as `land_detector.thresholds`
+        ("still_since_us", _I),  # -1 = the vehicle moves
+    ],
+    align=True,
+)
+"""Flight controller: samples, estimator, control loops. SI units, NED and FRD."""
+
+TRUE_TICK = np.dtype(
+    [("time_us", _I), ("motion", _F, WIDTH), ("power_w", _F), ("charge", _F)], align=True
+)
+"""The aircraft after a tick."""
+
+FLOWN_TICK = np.dtype(
+    [
+        ("time_us", _I),
+        ("healthy", _I),
+        ("state", _F, ROW_SIZE),
+        ("accel", _F, 3),
+        ("gyro", _F, 3),
+        ("mag", _F, 3),
+        ("pressure_hpa", _F),
+        ("temperature_c", _F),
+        ("demand_kind", _I),
+        ("demand", _F, DEMAND_SIZE),
+        ("output", _F, OUTPUT_SIZE),
+        ("motors", _F, 4),
+        ("battery", _F, 4),
+    ],
+    align=True,
+)
+"""The flight controller in a tick: the sample that it took, its estimate, what it commanded."""
+
+
+def new_aircraft() -> Record:
+    """Return a record of an aircraft without constants, all zero."""
+    record = np.zeros(1, AIRCRAFT)
+    record["motion"][0, 6] = 1.0
+    return record
+
+
+def new_sample() -> Record:
+    """Return a record of sensors that have not measured yet."""
+    return np.zeros(1, SAMPLE)
+
+
+def new_controller() -> Record:
+    """Return a record of a flight controller that has just booted."""
+    record = np.zeros(1, CONTROLLER)
+    never = ("baro_fused_us", "heading_fused_us", "gps_horizontal_us", "gps_vertical_us")
+    for name in (*never, "watch", "still_since_us"):
+        record[name] = -1
+    record["origin"] = record["velocity_before"] = np.nan
+    record["velocity_noise"] = 1.0
+    record["pressure_hpa"] = np.nan
+    record["transition"] = np.eye(N_STATES)
+    record["demand_kind"] = IDLE
+    return record

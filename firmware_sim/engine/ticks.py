@@ -1,0 +1,677 @@
+"""The compiled ticks of one vehicle: control, free flight, sensors, estimator.
+
+A tick begins with the newest sample already in the estimate: the loops turn it and the demand into
+motor commands, the aircraft moves, its sensors measure, and the estimator takes the new sample.
+`stretch` flies many ticks at a constant demand and returns as soon as Python has to act; `command`,
+`sense` and `estimate` are its parts, for ticks in which Python moves the body (contacts), changes
+the sample (faults) or fuses what is measured.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba.extending import register_jitable
+
+from airl_mav.control.cascade import (
+    Output,
+    attitude_tick,
+    cascade_tick,
+    filters,
+    rate_tick,
+    trajectory_tick,
+)
+from airl_mav.control.demand import AttitudeDemand, Demand, RateDemand, TrajectoryDemand
+from airl_mav.control.gains import unpack
+from airl_mav.core.constants import GRAVITY_M_S2, TICK_S, US_PER_S
+from airl_mav.core.frames import Geodetic, Vector, geodetic_to_local, local_to_geodetic
+from airl_mav.core.kernels import kernel, large_kernel
+from airl_mav.core.location import HOME, MAGNETIC_DECLINATION, MAGNETIC_FIELD_NED
+from airl_mav.vehicle import atmosphere
+from airl_mav.vehicle.airframe import airframe_of
+from airl_mav.vehicle.rigid_body import accelerate, drift
+from airl_mav.vehicle.rotation import Vec, conjugate, rotate
+from firmware_sim.autopilot import error_state as es
+from firmware_sim.autopilot.consistency import FAR, note_velocity
+from firmware_sim.autopilot.emergency_yaw import REFUSED_US
+from firmware_sim.autopilot.filter_kernel import fuse, predict, spread
+from firmware_sim.autopilot.land_detector import lifts_off, rests
+from firmware_sim.autopilot.yaw_estimator import feel, observe
+from firmware_sim.engine.dynamics import Speeds, absorb, actuate
+from firmware_sim.engine.kinematics import WIDTH, force, quaternion, rates, velocity, write
+from firmware_sim.engine.record import (
+    ATTITUDE,
+    BARO_ROW,
+    CHANGED,
+    FIRST,
+    GPS,
+    GPS_ROW,
+    IDLE,
+    LANDING,
+    LIFT_OFF,
+    MAG,
+    MAG_ROW,
+    OFF,
+    POSITION,
+    PRESSURE,
+    SEEN,
+    SUSPECT,
+    TRAJECTORY,
+    TRUSTED,
+    Fields,
+    Record,
+)
+
+NONE, NOISE, ROOM, FUSE, HEALTH, DETECTED, COLLIDED = 0, 1, 2, 3, 4, 5, 6
+"""Why `stretch` returned: all ticks are flown; a block of noise is used up; a contact is possible
+in the coming tick; Python has to fuse what the newest tick measured; the estimator has converged,
+or no longer is; the land detector has detected lift-off or landing; the vehicle has hit something
+(`Plant.touch`)."""
+
+REPEATED_BITS = 3
+"""`estimate` returns bits of `measured`; shifted by so many, which sensors repeated their last
+sample."""
+
+EVENT_BITS = 4
+"""`stretch` returns the number of complete ticks, shifted by these bits, and the event."""
+
+EVENT_MASK = (1 << EVENT_BITS) - 1
+
+ROOM_M = 0.15
+"""Contacts are impossible in a tick that begins with more room: 37 m/s in 4 ms [m]."""
+
+CALM_RATIO = 0.6
+"""Headings within this test ratio (3 standard deviations) are fused without further judgement; see
+`consistency.FAR`."""
+
+PA_PER_HPA = 100.0
+
+_INERTIAL, _COMPASS, _BAROMETER, _GPS, _WIND = range(5)
+"""Places in `noise_at`."""
+
+_NORTH, _EAST, _DOWN = MAGNETIC_FIELD_NED
+HEADING_BY_TURN_NED = np.array([-_DOWN * _NORTH, -_DOWN * _EAST, _NORTH**2 + _EAST**2]) / (
+    _NORTH**2 + _EAST**2
+)
+"""The field dips, so a tilt error turns the measured heading: seen from the world's axes,
+d innovation / d phi = (-tan(dip) cos(declination), -tan(dip) sin(declination), 1)."""
+
+_HOME_M = HOME.altitude_m
+_ATTITUDE, _RATES, _VELOCITY, _THRUST = 0, 4, 7, 10
+"""Layout of `output`."""
+
+register_jitable(geodetic_to_local)
+register_jitable(local_to_geodetic)
+register_jitable(atmosphere.pressure_hpa)
+register_jitable(atmosphere.altitude_m)
+register_jitable(atmosphere.temperature_c)
+
+
+# --- control
+
+
+@kernel
+def _store(out: Output, c: Fields) -> None:
+    for i in range(4):
+        c.output[_ATTITUDE + i] = out.attitude[i]
+        c.motors[i] = out.motors[i]
+    for i in range(3):
+        c.output[_RATES + i] = out.rates[i]
+        c.output[_VELOCITY + i] = out.velocity[i]
+    c.output[_THRUST] = out.thrust
+
+
+@large_kernel
+def control(c: Fields) -> None:
+    """Turn estimate and demand into motor commands: one tick of the cascade.
+
+    Args:
+        c: Fields of a flight controller; `output`, `motors` and `memory` are updated.
+    """
+    kind, s, d = c.demand_kind, c.state, c.demand
+    if kind == IDLE:
+        for i in range(4):
+            c.motors[i] = 0.0
+        return
+    gains = unpack(c.gains)
+    weights = filters(gains, TICK_S)
+    p, v = (s[0], s[1], s[2]), (s[3], s[4], s[5])
+    q, w = (s[6], s[7], s[8], s[9]), (s[10], s[11], s[12])
+    if kind == POSITION:
+        demand = Demand((d[0], d[1], d[2]), (d[3], d[4], d[5]), d[6], d[7])
+        _store(cascade_tick(p, v, q, w, demand, c.memory, gains, weights, TICK_S), c)
+    elif kind == TRAJECTORY:
+        path = TrajectoryDemand(
+            (d[0], d[1], d[2]), (d[3], d[4], d[5]), (d[6], d[7], d[8]), d[9], d[10]
+        )
+        _store(trajectory_tick(p, v, q, w, path, c.memory, gains, weights, TICK_S), c)
+    elif kind == ATTITUDE:
+        attitude = AttitudeDemand((d[0], d[1], d[2], d[3]), d[4], d[5])
+        _store(attitude_tick(v, q, w, attitude, c.memory, gains, weights, TICK_S), c)
+    else:
+        turn = RateDemand((d[0], d[1], d[2]), d[3])
+        _store(rate_tick(v, q, w, turn, c.memory, gains, weights, TICK_S), c)
+
+
+@kernel
+def control_record(controller: Record) -> None:
+    """Turn estimate and demand of a record (1,) into motor commands."""
+    control(controller[0])
+
+
+@kernel
+def _detect(c: Fields) -> bool:
+    """Return whether the vehicle has just left the ground, or has come to rest on it."""
+    thrust, down_m_s = c.output[_THRUST], c.output[_VELOCITY + 2]
+    if c.detecting == LIFT_OFF:
+        c.still_since_us = -1
+        return lifts_off(c.state, thrust, c.land)
+    if c.detecting != LANDING:
+        return False
+    if down_m_s <= 0.0 or not rests(c.state, thrust, c.land):
+        c.still_since_us = -1
+        return False
+    if c.still_since_us < 0:
+        c.still_since_us = c.time_us
+    return c.time_us - c.still_since_us >= c.land[0]
+
+
+@kernel
+def command(c: Fields, flown: Fields) -> None:
+    """Compute the motor commands of a tick and log it; note what is detected of the ground.
+
+    Args:
+        c: Fields of a flight controller, updated.
+        flown: Row of the log (`record.FLOWN_TICK`), written; its battery is that of the aircraft.
+    """
+    control(c)
+    log_flown(c, flown)
+    c.detected = 1 if _detect(c) else 0
+
+
+@kernel
+def log_flown(c: Fields, flown: Fields) -> None:
+    """Log a flight controller in a tick (`record.FLOWN_TICK`), but for the battery."""
+    flown.time_us, flown.healthy = c.time_us, c.healthy
+    for i in range(es.ROW_SIZE):
+        flown.state[i] = c.state[i]
+    for i in range(3):
+        flown.accel[i], flown.gyro[i], flown.mag[i] = c.accel[i], c.gyro[i], c.mag[i]
+    flown.pressure_hpa, flown.temperature_c = c.pressure_hpa, c.temperature_c
+    flown.demand_kind = c.demand_kind
+    for i in range(_THRUST + 1):
+        flown.demand[i], flown.output[i] = c.demand[i], c.output[i]
+    for i in range(4):
+        flown.motors[i] = c.motors[i]
+
+
+# --- aircraft
+
+
+@kernel
+def push(a: Fields, motors: Speeds, wind: Vector) -> tuple[Vec, Vec, Vec]:
+    """Advance the rotors by a tick; return centre of mass, force and torque as `actuate`."""
+    s = a.speeds
+    speeds, here, pushed, torque = actuate(
+        (s[0], s[1], s[2], s[3]), motors, a.motion, wind, a.airframe, a.rotor_lag
+    )
+    for i in range(4):
+        a.speeds[i] = speeds[i]
+    return here, pushed, torque
+
+
+@kernel
+def finish(a: Fields, after: Vector, wind: Vector, standing: bool) -> None:
+    """Take the motion after a tick (16,): time moves on, the battery drains."""
+    f, s = a.acceleration, a.speeds
+    a.power_w, felt, reading, a.charge = absorb(
+        a.motion,
+        after,
+        wind,
+        (s[0], s[1], s[2], s[3]),
+        standing,
+        (f[0], f[1], f[2]),
+        a.charge,
+        a.airframe,
+        a.power_model,
+        a.pack,
+        a.computer_w,
+        a.tick_s,
+    )
+    for i in range(3):
+        a.acceleration[i] = felt[i]
+    for i in range(4):
+        a.battery[i] = reading[i]
+    for i in range(WIDTH):
+        a.motion[i] = after[i]
+    a.ticks += 1
+    # Of the count: not every rate has a period of whole microseconds.
+    a.time_us = a.start_us + a.ticks * US_PER_S // a.rate_hz
+
+
+@kernel
+def _glide(a: Fields, c: Fields, wind: Vector, after: Vector) -> None:
+    """Move an aircraft that touches nothing by one tick; `after` (16,) is scratch."""
+    m, before, dt = c.motors, a.motion, a.tick_s
+    motors = (m[0], m[1], m[2], m[3]) if a.charge > 0.0 else (0.0, 0.0, 0.0, 0.0)
+    here, thrust, torque = push(a, motors, wind)
+    q, airframe = quaternion(before), airframe_of(a.airframe)
+    turn = rotate(conjugate(q), torque)
+    v, spin = accelerate(velocity(before), q, rates(before), thrust, turn, airframe, dt)
+    p, q_new, omega = drift(here, v, q, spin, dt)
+    if q_new[0] < 0.0:
+        q_new = (-q_new[0], -q_new[1], -q_new[2], -q_new[3])
+    write(p, v, q_new, omega, before, dt, after)
+    finish(a, after, wind, False)
+    a.room_m -= dt * (a.closing_m_s + math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]))
+
+
+@kernel
+def log(a: Fields, truth: Fields) -> None:
+    """Log the aircraft after a tick (`record.TRUE_TICK`)."""
+    truth.time_us, truth.power_w, truth.charge = a.time_us, a.power_w, a.charge
+    for i in range(WIDTH):
+        truth.motion[i] = a.motion[i]
+
+
+@kernel
+def _rest(a: Fields, wind: Vector, after: Vector) -> None:
+    """Let an aircraft stand where it is for one tick; `after` (16,) is scratch."""
+    row = a.motion
+    for i in range(WIDTH):
+        after[i] = row[i]
+    after[13], after[14], after[15] = rotate(conjugate(quaternion(row)), (0.0, 0.0, -GRAVITY_M_S2))
+    finish(a, after, wind, True)
+    a.room_m -= a.tick_s * a.closing_m_s
+
+
+@kernel
+def rest_record(aircraft: Record, wind: Vector) -> None:
+    """Let the aircraft of a record (1,) stand where it is for one tick."""
+    _rest(aircraft[0], wind, np.empty(WIDTH))
+
+
+@kernel
+def push_record(aircraft: Record, motors: Speeds, wind: Vector) -> tuple[Vec, Vec, Vec]:
+    """Advance the rotors of a record (1,) by a tick; return what `actuate` says of the body."""
+    return push(aircraft[0], motors, wind)
+
+
+@kernel
+def finish_record(aircraft: Record, after: Vector, wind: Vector, standing: bool) -> None:
+    """Take the motion after a tick (16,) into a record (1,); as `finish`."""
+    finish(aircraft[0], after, wind, standing)
+
+
+# --- sensors
+
+
+@kernel
+def is_due(schedule: Vector, time_us: int) -> bool:
+    """Return True once for every period of a sensor: rate [Hz], next sample [µs], its period."""
+    if time_us < schedule[1]:
+        return False
+    rate = schedule[0]
+    period = int(time_us * rate / US_PER_S)
+    # Rounding may put a time that lies on a boundary into the period before it.
+    if (period + 1) * US_PER_S / rate <= time_us:
+        period += 1
+    schedule[2], schedule[1] = period, (period + 1) * US_PER_S / rate
+    return True
+
+
+@kernel
+def sense(
+    a: Fields, sample: Fields, inertial: Vector, compass: Vector, barometer: Vector, gps: Vector
+) -> None:
+    """Measure: accelerometer and gyro, and the slower sensors that are due.
+
+    Args:
+        a: Fields of an aircraft; biases, drifts and schedules are updated.
+        sample: Fields of its sensors, written.
+        inertial: (n, 12) white noise: accelerometer, gyro, their biases.
+        compass: (n, 3) white noise.
+        barometer: (n, 2) white noise: drift, sample.
+        gps: (n, 9) white noise: wandering error, position, velocity.
+    """
+    row, sigma, now_us = a.motion, a.imu_sigma, a.time_us
+    white = inertial[a.noise_at[_INERTIAL]]
+    a.noise_at[_INERTIAL] += 1
+    felt, turning = force(row), rates(row)
+    for i in range(3):
+        a.accel_bias[i] += sigma[6 + i] * white[6 + i]
+        a.gyro_bias[i] += sigma[9 + i] * white[9 + i]
+        sample.accel[i] = felt[i] + a.accel_bias[i] + sigma[i] * white[i]
+        sample.gyro[i] = turning[i] + a.gyro_bias[i] + sigma[3 + i] * white[3 + i]
+    sample.time_us, sample.measured = now_us, 0
+    sample.temperature_c = atmosphere.temperature_c(_HOME_M - row[2])
+    if is_due(a.mag_rate, now_us):
+        white = compass[a.noise_at[_COMPASS]]
+        a.noise_at[_COMPASS] += 1
+        field = MAGNETIC_FIELD_NED
+        seen = rotate(conjugate(quaternion(row)), (field[0], field[1], field[2]))
+        for i in range(3):
+            sample.mag[i] = seen[i] + a.mag_sigma * white[i]
+        sample.measured |= MAG
+    if is_due(a.baro_rate, now_us):
+        white = barometer[a.noise_at[_BAROMETER]]
+        a.noise_at[_BAROMETER] += 1
+        a.baro_drift_pa += a.baro_step_pa * white[0]
+        off_pa = a.baro_drift_pa + a.baro_noise_pa * white[1]
+        sample.pressure_hpa = atmosphere.pressure_hpa(_HOME_M - row[2]) + off_pa / PA_PER_HPA
+        sample.measured |= PRESSURE
+    if a.gps_fitted != 0 and is_due(a.gps_rate, now_us):
+        white = gps[a.noise_at[_GPS]]
+        a.noise_at[_GPS] += 1
+        for i in range(3):
+            a.gps_error[i] = a.gps_keep * a.gps_error[i] + a.gps_drive * white[i]
+            sample.gps_position[i] = row[i] + a.gps_error[i] + a.gps_noise_m[i] * white[3 + i]
+            sample.gps_velocity[i] = row[3 + i] + a.gps_noise_m_s * white[6 + i]
+        sample.measured |= GPS
+
+
+@kernel
+def sense_record(
+    aircraft: Record,
+    sample: Record,
+    inertial: Vector,
+    compass: Vector,
+    barometer: Vector,
+    gps: Vector,
+) -> None:
+    """Measure by records (1,); as `sense`."""
+    sense(aircraft[0], sample[0], inertial, compass, barometer, gps)
+
+
+# --- estimator
+
+
+@kernel
+def _watch(c: Fields, row: int) -> None:
+    """Note that a sensor has measured something new."""
+    c.watch[row, SEEN] = c.watch[row, CHANGED] = c.time_us
+    if c.watch[row, FIRST] < 0:
+        c.watch[row, FIRST] = c.time_us
+
+
+@kernel
+def _copied(new: Vector, old: Vector) -> bool:
+    """Copy a sample (3,); return whether it differs from the one before."""
+    changed = False
+    for i in range(3):
+        changed = changed or new[i] != old[i]
+        old[i] = new[i]
+    return changed
+
+
+@kernel
+def _take(c: Fields, sample: Fields) -> int:
+    """Take the slower sensors' samples; return which of them repeat themselves."""
+    repeated = 0
+    if sample.measured & MAG:
+        if _copied(sample.mag, c.mag):
+            _watch(c, MAG_ROW)
+        else:
+            repeated |= MAG
+    if sample.measured & PRESSURE:
+        if sample.pressure_hpa != c.pressure_hpa:
+            _watch(c, BARO_ROW)
+        else:
+            repeated |= PRESSURE
+        c.pressure_hpa = sample.pressure_hpa
+    if sample.measured & GPS:
+        moved = _copied(sample.gps_position, c.gps_position)
+        if _copied(sample.gps_velocity, c.gps_velocity) or moved:
+            _watch(c, GPS_ROW)
+        else:
+            repeated |= GPS
+    return repeated
+
+
+@kernel
+def fuse_gps(c: Fields, sample: Fields) -> bool:
+    """Fuse a fix; return False, and leave all as it is, where it has to be judged first."""
+    if c.gps == OFF:
+        return True
+    known = not math.isnan(c.origin[0])
+    recent = c.gps_horizontal_us >= 0 and c.time_us - c.gps_horizontal_us < REFUSED_US
+    if c.gps != TRUSTED or not (known and recent):
+        return False
+    s, p, r_p, r_v = c.state, c.covariance, c.gps_variance[0], c.gps_variance[1]
+    deviations = np.empty(3)
+    for i in range(3):
+        off = sample.gps_velocity[i] - s[es.V + i]
+        deviations[i] = off / math.sqrt(p[es.VEL + i, es.VEL + i] + r_v)
+        # False for NaN, too.
+        if not abs(deviations[i]) <= FAR:
+            return False
+    here = local_to_geodetic(sample.gps_position, HOME)
+    place = geodetic_to_local(here, Geodetic(c.origin[0], c.origin[1], c.origin[2]))
+    north, east, down = sample.gps_velocity[0], sample.gps_velocity[1], sample.gps_velocity[2]
+    observe(c, north, east, math.sqrt(r_v))
+    note_velocity(c, deviations, s[es.ACCELERATION : es.SIGMA])
+    z, r = c.innovation4, c.variance4
+    z[0], z[1], z[2], z[3] = place[0] - s[0], place[1] - s[1], north - s[es.V], east - s[es.V + 1]
+    r[0] = r[1] = r_p
+    r[2] = r[3] = r_v
+    ratio = fuse(s, p, z, c.gps_horizontal_h, r)
+    s[es.RATIO] = ratio
+    if ratio <= 1.0:
+        c.gps_horizontal_us = c.time_us
+    z, r = c.innovation2, c.variance2
+    z[0], z[1] = place[2] - s[2], down - s[es.V + 2]
+    # A receiver's height is about half as good as its horizontal position.
+    r[0], r[1] = max(sample.gps_epv_m, math.sqrt(r_p)) ** 2, r_v
+    ratio = fuse(s, p, z, c.gps_vertical_h, r)
+    s[es.RATIO + 3] = ratio
+    if ratio <= 1.0:
+        c.gps_vertical_us = c.time_us
+    return True
+
+
+@kernel
+def fuse_pressure(c: Fields) -> None:
+    """Fuse the barometer's sample."""
+    height = atmosphere.altitude_m(c.pressure_hpa) - c.baro_origin_m
+    c.innovation[0] = height + c.state[es.P + 2] - c.state[es.BARO_OFFSET]
+    c.variance[0] = c.baro_variance
+    ratio = fuse(c.state, c.covariance, c.innovation, c.baro_h, c.variance)
+    c.state[es.RATIO + 1] = ratio
+    if ratio <= 1.0:
+        c.baro_fused_us = c.time_us
+
+
+@kernel
+def fuse_heading(c: Fields) -> bool:
+    """Fuse the compass's sample; return False where its innovation has to be judged first."""
+    if c.compass == OFF:
+        return True
+    if c.compass == SUSPECT:
+        return False
+    if not es.observe_heading(
+        c.state, c.mag, MAGNETIC_DECLINATION, HEADING_BY_TURN_NED, c.innovation, c.heading_h
+    ):
+        return True
+    total = spread(c.covariance, c.heading_h[0], np.empty(es.N_STATES)) + c.heading_variance
+    # False for NaN, too.
+    if not abs(c.innovation[0]) <= CALM_RATIO * es.GATE * math.sqrt(total):
+        return False
+    c.variance[0] = c.heading_variance
+    c.state[es.RATIO + 2] = fuse(c.state, c.covariance, c.innovation, c.heading_h, c.variance)
+    c.heading_fused_us = c.time_us
+    return True
+
+
+@large_kernel
+def estimate(c: Fields, sample: Fields) -> int:
+    """Predict by the IMU's newest sample, and fuse what was measured with it.
+
+    Args:
+        c: Fields of an aligned flight controller, updated.
+        sample: Fields of the aircraft, whose samples are taken.
+
+    Returns:
+        What is left for Python to fuse: bits of `measured`, and those of repeated samples.
+    """
+    c.time_us, c.temperature_c = sample.time_us, sample.temperature_c
+    for i in range(3):
+        c.accel[i], c.gyro[i] = sample.accel[i], sample.gyro[i]
+    predict(c.state, c.covariance, c.process_noise, c.transition, c.gyro, c.accel, TICK_S)
+    feel(c)
+    if sample.measured == 0:
+        return 0
+    repeated = _take(c, sample)
+    if repeated != 0:
+        return sample.measured | repeated << REPEATED_BITS
+    if sample.measured & GPS and not fuse_gps(c, sample):
+        return int(sample.measured)
+    if sample.measured & PRESSURE:
+        fuse_pressure(c)
+    if sample.measured & MAG and not fuse_heading(c):
+        return MAG
+    return 0
+
+
+@kernel
+def settle(c: Fields) -> bool:
+    """Judge the estimate after all of a tick is fused; return whether its health has changed."""
+    healthy = 1 if es.converged(c.state, c.covariance) else 0
+    changed: bool = healthy != c.healthy
+    c.healthy = healthy
+    return changed
+
+
+@kernel
+def begin_touch(
+    controller: Record, aircraft: Record, flown: Record, wind: Vector
+) -> tuple[Vec, Vec, Vec]:
+    """Begin a tick of records (1,) in which something else moves the body.
+
+    Returns centre of mass, force and torque as `actuate`.
+    """
+    a, c = aircraft[0], controller[0]
+    command(c, flown[0])
+    for i in range(4):
+        flown[0].battery[i] = a.battery[i]
+    m = c.motors
+    motors = (m[0], m[1], m[2], m[3]) if a.charge > 0.0 else (0.0, 0.0, 0.0, 0.0)
+    return push(a, motors, wind)
+
+
+@kernel
+def end_touch(
+    aircraft: Record,
+    sample: Record,
+    controller: Record,
+    after: Vector,
+    wind: Vector,
+    standing: bool,
+    inertial: Vector,
+    compass: Vector,
+    barometer: Vector,
+    gps: Vector,
+    truth: Record,
+) -> int:
+    """End a tick of records (1,) with the motion after it (16,): measure and estimate.
+
+    Returns the event: `FUSE`, `HEALTH` or `NONE`.
+    """
+    a, c = aircraft[0], controller[0]
+    finish(a, after, wind, standing)
+    log(a, truth[0])
+    sense(a, sample[0], inertial, compass, barometer, gps)
+    c.left = estimate(c, sample[0])
+    if c.left != 0:
+        return FUSE
+    return HEALTH if settle(c) else NONE
+
+
+@kernel
+def log_flown_record(controller: Record, flown: Record) -> None:
+    """Log a record (1,) of a flight controller in a tick; as `log_flown`."""
+    log_flown(controller[0], flown[0])
+
+
+@kernel
+def log_record(aircraft: Record, truth: Record) -> None:
+    """Log a record (1,) of an aircraft after a tick; as `log`."""
+    log(aircraft[0], truth[0])
+
+
+@kernel
+def settle_record(controller: Record) -> bool:
+    """Judge the estimate of a record (1,); return whether its health has changed."""
+    return settle(controller[0])
+
+
+# --- many ticks
+
+
+@large_kernel
+def stretch(
+    aircraft: Record,
+    sample: Record,
+    controller: Record,
+    ticks: int,
+    inertial: Vector,
+    compass: Vector,
+    barometer: Vector,
+    gps: Vector,
+    wind: Vector,
+    truths: Record,
+    flown: Record,
+) -> int:
+    """Fly up to so many ticks at a constant demand.
+
+    Args:
+        aircraft: (1,) its record, updated.
+        sample: (1,) of its sensors, updated.
+        controller: (1,) of an aligned flight controller, updated.
+        ticks: How many, at least 1.
+        inertial: As `sense`, and so the next three.
+        compass: (n, 3).
+        barometer: (n, 2).
+        gps: (n, 9).
+        wind: (n, 3) NED [m/s] of the coming ticks; a single row does not change.
+        truths: (ticks,) log of the aircraft, written.
+        flown: (ticks,) log of the flight controller, written.
+
+    Returns:
+        Complete ticks and event: `ticks << EVENT_BITS | event`. After `FUSE` one more tick is
+        flown and logged, whose measurements wait in the sample.
+    """
+    a, seen, c = aircraft[0], sample[0], controller[0]
+    after, at, steady = np.empty(WIDTH), a.noise_at, len(wind) == 1
+    for k in range(ticks):
+        if (
+            at[_INERTIAL] >= len(inertial)
+            or at[_COMPASS] >= len(compass)
+            or at[_BAROMETER] >= len(barometer)
+            or at[_GPS] >= len(gps)
+            or (not steady and at[_WIND] >= len(wind))
+        ):
+            return k << EVENT_BITS | NOISE
+        if not a.room_m > ROOM_M:
+            return k << EVENT_BITS | ROOM
+        row = flown[k]
+        command(c, row)
+        for i in range(4):
+            row.battery[i] = a.battery[i]
+        air = wind[0 if steady else at[_WIND]]
+        if not steady:
+            at[_WIND] += 1
+        if a.resting != 0:
+            _rest(a, air, after)
+        else:
+            _glide(a, c, air, after)
+        log(a, truths[k])
+        sense(a, seen, inertial, compass, barometer, gps)
+        c.left = estimate(c, seen)
+        if c.left != 0:
+            return k << EVENT_BITS | FUSE
+        if settle(c):
+            return (k + 1) << EVENT_BITS | HEALTH
+        if c.detected != 0:
+            return (k + 1) << EVENT_BITS | DETECTED
+    return ticks << EVENT_BITS | NONE

@@ -1,0 +1,117 @@
+"""The autopilot's state in a tick that was flown, by the log of compiled ticks."""
+
+# ruff: noqa: D102 (what the properties are says `AutopilotState`)
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from airl_mav.core.frames import Vector
+from firmware_sim.autopilot import error_state as es
+from firmware_sim.autopilot.autopilot_state import AutopilotState, Estimate, Setpoint
+from firmware_sim.engine.kinematics import POSITION, QUATERNION, RATES, VELOCITY
+from firmware_sim.engine.record import POSITION as POSITION_DEMAND
+from firmware_sim.engine.record import TRAJECTORY
+from firmware_sim.interfaces import BatterySample, Truth
+
+
+def truth_of(tick: Any) -> Truth:
+    """Return the true state of a tick of an aircraft (`engine.record.TRUE_TICK`)."""
+    row = tick["motion"].copy()
+    power_w, charge = float(tick["power_w"]), float(tick["charge"])
+    parts = row[POSITION], row[VELOCITY], row[QUATERNION], row[RATES]
+    return Truth(int(tick["time_us"]), *parts, power_w, charge)
+
+
+class FlownState:
+    """Implements `AutopilotState`: what changes from tick to tick by its log, the rest by another.
+
+    That other state is of the end of the ticks: status, home, parameters.
+    """
+
+    def __init__(self, state: AutopilotState, tick: Any) -> None:
+        """Take the state after the ticks, and one of them (`engine.record.FLOWN_TICK`)."""
+        self._state, self._tick = state, tick
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._state, name)
+
+    @property
+    def time_us(self) -> int:
+        return int(self._tick["time_us"])
+
+    @property
+    def estimate(self) -> Estimate:
+        row: Vector = self._tick["state"].copy()
+        return Estimate(
+            self.time_us,
+            row[es.P : es.V],
+            row[es.V : es.Q],
+            row[es.ACCELERATION : es.SIGMA],
+            row[es.Q : es.RATES],
+            row[es.RATES : es.GYRO_BIAS],
+            row[es.GYRO_BIAS : es.ACCEL_BIAS],
+            row[es.ACCEL_BIAS : es.BARO_OFFSET],
+            row[es.SIGMA : es.RATIO],
+            row[es.RATIO :],
+            bool(self._tick["healthy"]),
+        )
+
+    @property
+    def setpoint(self) -> Setpoint:
+        kind, demand = self._tick["demand_kind"], self._tick["demand"].copy()
+        velocity = self._output(7, 10)
+        if kind not in (POSITION_DEMAND, TRAJECTORY):
+            return Setpoint(self._tick["state"][:3].copy(), velocity, math.nan, 0.0)
+        yaw = 6 if kind == POSITION_DEMAND else 9
+        return Setpoint(demand[:3], velocity, float(demand[yaw]), float(demand[yaw + 1]))
+
+    @property
+    def attitude_setpoint(self) -> Vector:
+        return self._output(0, 4)
+
+    @property
+    def rate_setpoint(self) -> Vector:
+        return self._output(4, 7)
+
+    @property
+    def thrust_setpoint(self) -> float:
+        return float(self._tick["output"][10])
+
+    @property
+    def accel(self) -> Vector:
+        return self._vector("accel")
+
+    @property
+    def gyro(self) -> Vector:
+        return self._vector("gyro")
+
+    @property
+    def mag(self) -> Vector:
+        return self._vector("mag")
+
+    @property
+    def pressure_hpa(self) -> float:
+        return float(self._tick["pressure_hpa"])
+
+    @property
+    def temperature_c(self) -> float:
+        return float(self._tick["temperature_c"])
+
+    @property
+    def motors(self) -> tuple[float, float, float, float]:
+        a, b, c, d = self._tick["motors"].tolist()
+        return a, b, c, d
+
+    @property
+    def battery(self) -> BatterySample:
+        return BatterySample(*self._tick["battery"].tolist())
+
+    def _vector(self, name: str) -> Vector:
+        values: Vector = self._tick[name].copy()
+        return values
+
+    def _output(self, first: int, end: int) -> Vector:
+        values: Vector = self._tick["output"][first:end].copy()
+        return values

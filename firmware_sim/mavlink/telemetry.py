@@ -1,0 +1,521 @@
+"""The fast streams: packed in compiled code, many ticks at a time, from one table.
+
+Each message of `FIELDS` names a source for every field, in the order of its definition; offsets and
+types on the wire are pymavlink's. Sources are computed once for every tick in which a message is
+due. Units and "unknown" values: MAVLink common.xml and PX4 src/modules/mavlink/streams/*.hpp.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from itertools import accumulate
+from types import MappingProxyType
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.core.constants import GRAVITY_M_S2
+from airl_mav.core.frames import Geodetic, Vector, local_to_geodetic
+from airl_mav.core.kernels import kernel, large_kernel
+from airl_mav.vehicle import atmosphere
+from airl_mav.vehicle.rotation import rotate, yaw_of
+from firmware_sim.autopilot import error_state as es
+from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState
+from firmware_sim.engine.record import FLOWN_TICK, POSITION, TRAJECTORY, Fields, Record
+from firmware_sim.mavlink.codec import COMPONENT_ID, dialect, message_id
+from firmware_sim.mavlink.streams import units
+from firmware_sim.mavlink.streams.distance import clearance
+
+Ints = NDArray[np.int64]
+Bytes = NDArray[np.uint8]
+
+_SOURCES: Final = (
+    *("zero", "nan", "one", "healthy", "located"),
+    *("time_us", "boot_ms"),
+    *("roll", "pitch", "yaw", "qw", "qx", "qy", "qz", "p", "q", "r"),
+    *("x", "y", "z", "vx", "vy", "vz"),
+    *("var_x", "var_y", "var_z", "var_roll", "var_pitch", "var_yaw", "var_vx", "var_vy", "var_vz"),
+    *("lat_e7", "lon_e7", "alt_mm", "above_home_mm", "vx_cm", "vy_cm", "vz_cm", "yaw_cdeg"),
+    *("ax", "ay", "az", "wx", "wy", "wz", "mag_x", "mag_y", "mag_z"),
+    *("pressure", "pressure_alt", "temperature", "imu_fields"),
+    *("amsl", "up", "above_home", "terrain", "clearance"),
+    *("ground_speed", "heading_deg", "throttle", "hud_alt", "climb"),
+    *("sp_qw", "sp_qx", "sp_qy", "sp_qz", "sp_p", "sp_q", "sp_r", "sp_thrust"),
+    *("sp_mask", "sp_x", "sp_y", "sp_z", "sp_vx", "sp_vy", "sp_vz", "sp_ax", "sp_ay", "sp_az"),
+    *("sp_yaw", "sp_yaw_rate"),
+    *("pwm_1", "pwm_2", "pwm_3", "pwm_4", "pwm_off"),
+    *("local_ned", "autopilot"),
+)
+_AT: Final = {name: place for place, name in enumerate(_SOURCES)}
+
+_POSE_DIAGONAL = ("var_x", "var_y", "var_z", "var_roll", "var_pitch", "var_yaw")
+_VELOCITY_DIAGONAL = ("var_vx", "var_vy", "var_vz", "nan", "nan", "nan")
+
+
+def _triangle(diagonal: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the sources of a 6 x 6 matrix of which the diagonal is known."""
+    places = iter(diagonal)
+    return tuple(next(places) if i in units.DIAGONAL else "nan" for i in range(21))
+
+
+FIELDS: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {
+        "ATTITUDE": ("boot_ms", "roll", "pitch", "yaw", "p", "q", "r"),
+        "ATTITUDE_QUATERNION": ("boot_ms", "qw", "qx", "qy", "qz", "p", "q", "r", *("zero",) * 4),
+        "LOCAL_POSITION_NED": ("boot_ms", "x", "y", "z", "vx", "vy", "vz"),
+        "ODOMETRY": (
+            *("time_us", "local_ned", "local_ned", "x", "y", "z", "qw", "qx", "qy", "qz"),
+            *("vx", "vy", "vz", "p", "q", "r"),
+            *_triangle(_POSE_DIAGONAL),
+            *_triangle(_VELOCITY_DIAGONAL),
+            *("zero", "autopilot", "zero"),
+        ),
+        "GLOBAL_POSITION_INT": (
+            *("boot_ms", "lat_e7", "lon_e7", "alt_mm", "above_home_mm"),
+            *("vx_cm", "vy_cm", "vz_cm", "yaw_cdeg"),
+        ),
+        "HIGHRES_IMU": (
+            *("time_us", "ax", "ay", "az", "wx", "wy", "wz", "mag_x", "mag_y", "mag_z"),
+            *("pressure", "zero", "pressure_alt", "temperature", "imu_fields", "zero"),
+        ),
+        "ALTITUDE": (
+            *("time_us", "pressure_alt", "amsl", "up", "above_home", "terrain", "clearance"),
+        ),
+        "ATTITUDE_TARGET": (
+            *("boot_ms", "zero", "sp_qw", "sp_qx", "sp_qy", "sp_qz", "sp_p", "sp_q", "sp_r"),
+            *("sp_thrust", "zero", "zero", "zero"),
+        ),
+        "POSITION_TARGET_LOCAL_NED": (
+            *("boot_ms", "local_ned", "sp_mask", "sp_x", "sp_y", "sp_z", "sp_vx", "sp_vy"),
+            *("sp_vz", "sp_ax", "sp_ay", "sp_az", "sp_yaw", "sp_yaw_rate"),
+        ),
+        "SERVO_OUTPUT_RAW": (
+            *("time_us", "zero", "pwm_1", "pwm_2", "pwm_3", "pwm_4"),
+            *("pwm_off",) * 12,
+        ),
+        "VFR_HUD": ("zero", "ground_speed", "heading_deg", "throttle", "hud_alt", "climb"),
+    }
+)
+"""The messages and the sources of their fields."""
+
+NEEDS: Mapping[str, str] = MappingProxyType(
+    {"LOCAL_POSITION_NED": "healthy", "GLOBAL_POSITION_INT": "located"}
+)
+"""A source without which there is nothing to say."""
+
+_IMU_FIELDS = 0b1_1011_1111_1111
+"""HIGHRES_IMU_UPDATED_FLAGS: all but differential pressure."""
+
+_PWM_DISARMED, _PWM_MIN, _PWM_SPAN = 900, 1_000, 1_000
+"""Pulse widths [µs] of PX4's simulated outputs (src/modules/simulation/pwm_out_sim)."""
+
+_FLOAT, _SIZES = 0, {"f": 4, "i": 4, "I": 4, "h": 2, "H": 2, "b": 1, "B": 1, "q": 8, "Q": 8}
+_FIELD_FORMAT = re.compile(r"(\d*)([a-zA-Z])")
+
+_LARGEST = 280
+"""Bytes of the largest MAVLink 2 frame."""
+
+
+class _Table(NamedTuple):
+    """The messages as arrays: m messages, f fields of all together."""
+
+    ids: Ints  # (m,)
+    extras: Ints  # (m,) seed of the checksum
+    sizes: Ints  # (m,) bytes of the payload
+    needs: Ints  # (m,) source that must not be 0
+    first: Ints  # (m + 1,) of the fields
+    sources: Ints  # (f,)
+    offsets: Ints  # (f,) in the payload
+    kinds: Ints  # (f,) 0 = float32, else bytes of an integer
+
+
+def _table() -> _Table:
+    heads, fields, first = [], [], [0]
+    for name, sources in FIELDS.items():
+        kind = dialect.mavlink_map[message_id(name)]
+        heads.append((kind.id, kind.crc_extra, kind.unpacker.size, _AT[NEEDS.get(name, "one")]))
+        formats = _FIELD_FORMAT.findall(kind.unpacker.format)
+        counts = [int(count or 1) for count, _ in formats]
+        sizes = [count * _SIZES[code] for count, (_, code) in zip(counts, formats, strict=True)]
+        starts = accumulate(sizes, initial=0)
+        wire = {
+            field: (start, code, count)
+            for field, start, count, (_, code) in zip(
+                kind.ordered_fieldnames, starts, counts, formats, strict=False
+            )
+        }
+        places = [
+            (start + i * _SIZES[code], _FLOAT if code == "f" else _SIZES[code])
+            for start, code, count in (wire[field] for field in kind.fieldnames)
+            for i in range(count)
+        ]
+        # Extension fields come last; those that are not named are zero.
+        fields += [(_AT[source], *place) for source, place in zip(sources, places, strict=False)]
+        first.append(len(fields))
+    ids, extras, sizes_, needs = np.array(heads, np.int64).T
+    sources_, offsets, kinds = np.array(fields, np.int64).T
+    columns = (ids, extras, sizes_, needs, np.array(first), sources_, offsets, kinds)
+    return _Table(*(np.ascontiguousarray(column, np.int64) for column in columns))
+
+
+TABLE = _table()
+NUMBERS: Mapping[str, int] = MappingProxyType({name: i for i, name in enumerate(FIELDS)})
+"""Place of each message in the table."""
+
+
+def _crc_table() -> Ints:
+    """Return CRC-16/MCRF4XX by byte (MAVLink's X.25 checksum)."""
+    table = np.zeros(256, np.int64)
+    for byte in range(256):
+        crc = byte
+        for _ in range(8):
+            crc = (crc >> 1) ^ 0x8408 if crc & 1 else crc >> 1
+        table[byte] = crc
+    return table
+
+
+_CRC = _crc_table()
+
+# What stays the same while compiled ticks are flown.
+_LATITUDE, _LONGITUDE, _ORIGIN_M, _HOME_M, _ARMED, _HOVER, _TERRAIN, _CLEARANCE = range(8)
+
+
+def context_of(state: AutopilotState) -> Vector:
+    """Return what the messages need besides a tick's log (8,); NaN = not known."""
+    context = np.full(8, math.nan)
+    if state.origin is not None:
+        context[:_HOME_M] = state.origin
+    if state.home is not None:
+        context[_HOME_M] = state.home.altitude_m
+    context[_ARMED] = state.status.arming is Arming.ARMED
+    context[_HOVER] = state.hover_thrust
+    if state.clearance is not None:
+        down = float(state.estimate.position[2])
+        context[_TERRAIN], context[_CLEARANCE] = clearance(state, down)
+    return context
+
+
+def flown_of(state: AutopilotState) -> Record:
+    """Return a snapshot as the log of a tick (1,)."""
+    flown, estimate, wanted = np.zeros(1, FLOWN_TICK), state.estimate, state.setpoint
+    row = flown["state"][0]
+    row[es.P : es.V], row[es.V : es.Q] = estimate.position, estimate.velocity
+    row[es.Q : es.RATES], row[es.RATES : es.GYRO_BIAS] = (
+        estimate.quaternion,
+        estimate.angular_velocity,
+    )
+    row[es.GYRO_BIAS : es.ACCEL_BIAS] = estimate.gyro_bias
+    row[es.ACCEL_BIAS : es.BARO_OFFSET] = estimate.accel_bias
+    row[es.SIGMA : es.RATIO] = estimate.sigma
+    for name, value in (
+        ("time_us", state.time_us),
+        ("healthy", estimate.healthy),
+        ("accel", state.accel),
+        ("gyro", state.gyro),
+        ("mag", state.mag),
+        ("pressure_hpa", state.pressure_hpa),
+        ("temperature_c", state.temperature_c),
+        ("demand_kind", POSITION),
+        ("motors", state.motors),
+        ("battery", state.battery),
+    ):
+        flown[name] = value
+    flown["demand"][0, :8] = (*wanted.position, *wanted.velocity, wanted.yaw, wanted.yaw_rate)
+    flown["output"] = (
+        *state.attitude_setpoint,
+        *state.rate_setpoint,
+        *wanted.velocity,
+        state.thrust_setpoint,
+    )
+    return flown
+
+
+# --- sources
+
+
+@kernel
+def _put3(v: Vector, at: int, a: float, b: float, c: float) -> None:
+    v[at], v[at + 1], v[at + 2] = a, b, c
+
+
+@kernel
+def _estimated(v: Vector, row: Vector) -> None:
+    """Write attitude, rates, position, velocity and their variances."""
+    w, x, y, z = row[es.Q], row[es.Q + 1], row[es.Q + 2], row[es.Q + 3]
+    roll = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+    pitch = math.asin(min(1.0, max(-1.0, 2.0 * (w * y - z * x))))
+    _put3(v, _ROLL, roll, pitch, yaw_of((w, x, y, z)))
+    for i in range(4):
+        v[_QW + i] = row[es.Q + i]
+    for i in range(3):
+        v[_P + i] = row[es.RATES + i]
+        v[_X + i], v[_VX + i] = row[es.P + i], row[es.V + i]
+        v[_VAR_X + i] = row[es.SIGMA + i] ** 2
+        v[_VAR_ROLL + i] = row[es.SIGMA + 6 + i] ** 2
+        v[_VAR_VX + i] = row[es.SIGMA + 3 + i] ** 2
+        v[_VX_CM + i] = units.cm_s(row[es.V + i])
+    v[_YAW_CDEG] = units.centidegrees(v[_ROLL + 2])
+    north, east = row[es.V], row[es.V + 1]
+    v[_GROUND_SPEED], v[_CLIMB] = math.hypot(north, east), -row[es.V + 2]
+    v[_HEADING_DEG] = units.int16(math.degrees(v[_ROLL + 2]) % 360.0) % 360
+
+
+@kernel
+def _placed(v: Vector, row: Vector, pressure_alt: float, context: Vector) -> None:
+    """Write where the vehicle is on the globe, and its altitudes."""
+    down, origin_m, home_m = row[es.P + 2], context[_ORIGIN_M], context[_HOME_M]
+    known = not math.isnan(origin_m)
+    v[_LOCATED] = 0.0
+    if known and math.isfinite(row[es.P]) and math.isfinite(row[es.P + 1]) and math.isfinite(down):
+        origin = Geodetic(context[_LATITUDE], context[_LONGITUDE], origin_m)
+        here = local_to_geodetic(row[es.P : es.V], origin)
+        v[_LOCATED] = 1.0
+        v[_LAT_E7] = units.deg_e7(here.latitude_deg)
+        v[_LAT_E7 + 1] = units.deg_e7(here.longitude_deg)
+        v[_LAT_E7 + 2] = units.mm(here.altitude_m)
+        v[_LAT_E7 + 3] = units.mm(here.altitude_m - (origin_m if math.isnan(home_m) else home_m))
+    v[_UP] = v[_ABOVE_HOME] = -down
+    v[_AMSL] = origin_m - down
+    v[_HUD_ALT] = origin_m - down if known else pressure_alt
+    if known and not math.isnan(home_m):
+        v[_ABOVE_HOME] = origin_m - down - home_m
+    v[_TERRAIN_AT], v[_TERRAIN_AT + 1] = context[_TERRAIN], context[_CLEARANCE]
+
+
+@kernel
+def _wanted(v: Vector, row: Fields, context: Vector) -> None:
+    """Write the setpoints of the loops, and what the motors are told.
+
+    Source: PX4 1.16, PositionControl::getLocalPositionSetpoint: the heading, the yaw rate and the
+    acceleration are always filled in. Disarmed there is nothing else.
+    """
+    out, d, kind, armed = row.output, row.demand, row.demand_kind, context[_ARMED] != 0.0
+    for i in range(7):
+        v[_SP_QW + i] = out[i]
+    thrust = out[10]
+    v[_SP_THRUST] = thrust
+    v[_THROTTLE] = units.saturate(100.0 * thrust if armed else 0.0, 0, units.UINT16_MAX - 1, 0)
+    q_sp = (out[0], out[1], out[2], out[3])
+    yaw, yaw_rate = math.nan, 0.0
+    if kind == POSITION:
+        yaw, yaw_rate = d[6], d[7]
+    elif kind == TRAJECTORY:
+        yaw, yaw_rate = d[9], d[10]
+    mask = 0
+    for i in range(3):
+        # Attitudes and body rates leave the vehicle where it is.
+        place = d[i] if kind in (POSITION, TRAJECTORY) else row.state[es.P + i]
+        speed = out[7 + i]
+        if not armed:
+            place = speed = math.nan
+        v[_SP_X + i], v[_SP_VX + i] = place, speed
+        mask |= 0 if math.isfinite(place) else _X_IGNORE << i
+        mask |= 0 if math.isfinite(speed) else _VX_IGNORE << i
+    v[_SP_MASK] = mask
+    if armed:
+        north, east, down = rotate(q_sp, (0.0, 0.0, thrust / context[_HOVER]))
+        g = GRAVITY_M_S2
+        _put3(v, _SP_AX, -g * north, -g * east, g * (1.0 - down))
+        v[_SP_YAW] = yaw if math.isfinite(yaw) else yaw_of(q_sp)
+        v[_SP_YAW + 1] = yaw_rate if math.isfinite(yaw_rate) else 0.0
+    else:
+        # PX4's way to say no thrust.
+        _put3(v, _SP_AX, 0.0, 0.0, 100.0)
+        v[_SP_YAW], v[_SP_YAW + 1] = v[_ROLL + 2], 0.0
+    for i in range(4):
+        pulse = _PWM_MIN + units.saturate(_PWM_SPAN * row.motors[i], 0, _PWM_SPAN, 0)
+        v[_PWM_1 + i] = pulse if armed else _PWM_DISARMED
+
+
+@large_kernel
+def _sources(v: Vector, row: Fields, context: Vector) -> None:
+    """Write the sources (len(_SOURCES),) of a tick's log."""
+    s = row.state
+    v[_ZERO], v[_NAN], v[_ONE], v[_HEALTHY] = 0.0, math.nan, 1.0, row.healthy
+    v[_TIME_US], v[_TIME_US + 1] = row.time_us, units.boot_ms(row.time_us)
+    v[_PWM_1 + 4], v[_LOCAL_NED], v[_LOCAL_NED + 1] = _PWM_DISARMED, _FRAME, _AUTOPILOT
+    _estimated(v, s)
+    for i in range(3):
+        v[_AX + i] = row.accel[i] - s[es.ACCEL_BIAS + i]
+        v[_AX + 3 + i] = row.gyro[i] - s[es.GYRO_BIAS + i]
+        v[_AX + 6 + i] = row.mag[i]
+    pressure_alt = atmosphere.altitude_m(row.pressure_hpa)
+    v[_PRESSURE], v[_PRESSURE + 1] = row.pressure_hpa, pressure_alt
+    v[_PRESSURE + 2], v[_PRESSURE + 3] = row.temperature_c, _IMU_FIELDS
+    _placed(v, s, pressure_alt, context)
+    _wanted(v, row, context)
+
+
+(_ZERO, _NAN, _ONE, _HEALTHY, _LOCATED, _TIME_US, _ROLL, _QW, _P, _X, _VX, _VAR_X, _VAR_ROLL) = (
+    _AT[name]
+    for name in (
+        *("zero", "nan", "one", "healthy", "located", "time_us", "roll", "qw", "p", "x", "vx"),
+        *("var_x", "var_roll"),
+    )
+)
+(_VAR_VX, _LAT_E7, _VX_CM, _YAW_CDEG, _AX, _PRESSURE, _AMSL, _UP, _ABOVE_HOME, _TERRAIN_AT) = (
+    _AT[name]
+    for name in (
+        *("var_vx", "lat_e7", "vx_cm", "yaw_cdeg", "ax", "pressure", "amsl", "up", "above_home"),
+        "terrain",
+    )
+)
+(_GROUND_SPEED, _HEADING_DEG, _THROTTLE, _HUD_ALT, _CLIMB, _SP_QW, _SP_THRUST, _SP_MASK) = (
+    _AT[name]
+    for name in (
+        *("ground_speed", "heading_deg", "throttle", "hud_alt", "climb", "sp_qw", "sp_thrust"),
+        "sp_mask",
+    )
+)
+(_SP_X, _SP_VX, _SP_AX, _SP_YAW, _PWM_1, _LOCAL_NED) = (
+    _AT[name] for name in ("sp_x", "sp_vx", "sp_ax", "sp_yaw", "pwm_1", "local_ned")
+)
+_X_IGNORE: int = dialect.POSITION_TARGET_TYPEMASK_X_IGNORE
+_VX_IGNORE: int = dialect.POSITION_TARGET_TYPEMASK_VX_IGNORE
+_FRAME: int = dialect.MAV_FRAME_LOCAL_NED
+_AUTOPILOT: int = dialect.MAV_ESTIMATOR_TYPE_AUTOPILOT
+
+
+# --- frames
+
+
+@kernel
+def _write(out: Bytes, at: int, kind: int, value: float, word: Vector, bits: Bytes) -> None:
+    """Write a value at a place: 0 = float32, else an integer of so many bytes, little endian."""
+    if kind == 0:
+        word[0] = value
+        for i in range(4):
+            out[at + i] = bits[i]
+    else:
+        whole = np.int64(value)
+        for i in range(kind):
+            out[at + i] = (whole >> (8 * i)) & 0xFF
+
+
+@large_kernel
+def _frame(
+    number: int, v: Vector, system: int, seq: int, out: Bytes, at: int, word: Any, bits: Bytes,
+    table: _Table,
+) -> int:  # fmt: skip
+    """Write the MAVLink 2 frame of a message of the table at `at`; return where it ends."""
+    size, start = table.sizes[number], at + 10
+    for i in range(size):
+        out[start + i] = 0
+    for f in range(table.first[number], table.first[number + 1]):
+        _write(out, start + table.offsets[f], table.kinds[f], v[table.sources[f]], word, bits)
+    # Trailing zeros are not sent.
+    while size > 1 and out[start + size - 1] == 0:
+        size -= 1
+    identity = table.ids[number]
+    out[at], out[at + 1], out[at + 2], out[at + 3] = 0xFD, size, 0, 0
+    out[at + 4], out[at + 5], out[at + 6] = seq, system, COMPONENT_ID
+    out[at + 7], out[at + 8], out[at + 9] = identity & 0xFF, identity >> 8 & 0xFF, identity >> 16
+    crc = 0xFFFF
+    for i in range(at + 1, start + size):
+        crc = crc >> 8 ^ _CRC[(crc ^ out[i]) & 0xFF]
+    crc = crc >> 8 ^ _CRC[(crc ^ table.extras[number]) & 0xFF]
+    out[start + size], out[start + size + 1] = crc & 0xFF, crc >> 8
+    return start + size + 2
+
+
+@large_kernel
+def _pack(
+    flown: Record,
+    times_us: Ints,
+    context: Vector,
+    table: _Table,
+    numbers: Ints,
+    due_us: Ints,
+    interval_us: Ints,
+    system: int,
+    seq: int,
+    out: Bytes,
+    ends: Ints,
+    v: Vector,
+    word: Any,
+    bits: Bytes,
+) -> int:
+    """Pack what is due after each tick; return the number of frames.
+
+    Args:
+        flown: (n,) logs of ticks.
+        times_us: (n,) when each of them ended [µs].
+        context: As `context_of`.
+        table: The messages.
+        numbers: (s,) place of each stream in the table; -1 = it is not there.
+        due_us: (s,) next time of each stream [µs], updated.
+        interval_us: (s,) its interval [µs]; 0 = off.
+        system: System id of the sender.
+        seq: First sequence number.
+        out: Written: the frames, one behind the other.
+        ends: Written: where each of them ends; no more than it has room for are packed.
+        v: Scratch for the sources.
+        word: (1,) float32, and `bits` its bytes.
+        bits: (4,).
+    """
+    at, n = 0, 0
+    for k in range(len(flown)):
+        row, now_us, made = flown[k], times_us[k], False
+        for s in range(len(numbers)):
+            if numbers[s] < 0 or interval_us[s] == 0 or due_us[s] > now_us or n == len(ends):
+                continue
+            late_us = now_us - due_us[s]
+            due_us[s] += interval_us[s] * (1 + late_us // interval_us[s])
+            if not made:
+                _sources(v, row, context)
+                made = True
+            if v[table.needs[numbers[s]]] != 0.0:
+                at = _frame(numbers[s], v, system, seq + n & 0xFF, out, at, word, bits, table)
+                ends[n] = at
+                n += 1
+    return n
+
+
+class Packer:
+    """Packs the fast streams of one link."""
+
+    def __init__(self) -> None:
+        self._out = np.zeros(0, np.uint8)
+        self._ends = np.zeros(0, np.int64)
+        self._values = np.zeros(len(_SOURCES))
+        self._word = np.zeros(1, np.float32)
+        self._bits = self._word.view(np.uint8)
+
+    def pack(
+        self,
+        flown: Record,
+        times_us: Ints,
+        context: Vector,
+        numbers: Ints,
+        due_us: Ints,
+        interval_us: Ints,
+        system: int,
+        seq: int,
+        most: int,
+    ) -> list[bytes]:
+        """Return the frames that are due after each of n ticks, `most` a tick; as `_pack`."""
+        most *= len(flown)
+        if len(self._ends) < most:
+            self._ends = np.zeros(most, np.int64)
+            self._out = np.zeros(most * _LARGEST, np.uint8)
+        n = _pack(
+            *(flown, times_us, context, TABLE, numbers, due_us, interval_us, system, seq),
+            *(self._out, self._ends[:most], self._values, self._word, self._bits),
+        )
+        if n == 0:
+            return []
+        ends = self._ends[:n].tolist()
+        data = self._out[: ends[-1]].tobytes()
+        return [data[start:end] for start, end in zip([0, *ends], ends, strict=False)]
+
+
+def payload(name: str, state: AutopilotState) -> bytes | None:
+    """Return the payload of one of the messages, without trailing zeros; None = nothing to say."""
+    number, once = np.array([NUMBERS[name]]), np.ones(1, np.int64)
+    frames = Packer().pack(
+        flown_of(state), once, context_of(state), number, np.zeros(1, np.int64), once, 1, 0, 1
+    )
+    return frames[0][10:-2] if frames else None

@@ -1,0 +1,87 @@
+"""Walls, obstacles and ground of an arena as arrays, for kernels."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.arena.geometry import Arena, Shape
+from airl_mav.arena.ground import Relief, no_relief
+from airl_mav.core.frames import Vector
+from airl_mav.core.kernels import kernel
+from airl_mav.vehicle.rotation import Vec
+from firmware_sim.plant.body import walls_of
+from firmware_sim.plant.tours import tour_arrays
+
+
+class Solids(NamedTuple):
+    """Walls and obstacles of an arena, n of them, of which the last m move; and its ground."""
+
+    shape: NDArray[np.int8]  # (n,)
+    center: Vector  # (n, 3) NED [m]; of those that move it is updated
+    size: Vector  # (n, 3) half extents [m]
+    yaw: Vector  # (n,) [rad]
+    times_s: Vector  # (m, 1 + k) as `tour_arrays`
+    points: Vector  # (m, k, 2)
+    leg: NDArray[np.int64]  # (m,)
+    relief: Relief
+
+
+def solids_of(arena: Arena | None) -> tuple[Solids, list[str]]:
+    """Return the walls, obstacles and ground of an arena, and their names; None has none."""
+    if arena is None:
+        return (
+            Solids(
+                np.zeros(0, np.int8),
+                np.zeros((0, 3)),
+                np.zeros((0, 3)),
+                np.zeros(0),
+                np.full((0, 2), np.inf),
+                np.zeros((0, 1, 2)),
+                np.zeros(0, np.int64),
+                no_relief(),
+            ),
+            [],
+        )
+    walls, o = walls_of(arena), arena.obstacles
+    times, points = tour_arrays(arena)
+    solids = Solids(
+        np.concatenate([np.full(len(walls), Shape.BOX, np.int8), o.shape]),
+        np.concatenate([np.array([center for _, center, _ in walls]), o.center]),
+        np.concatenate([np.array([half for _, _, half in walls]), o.half_size]),
+        np.concatenate([np.zeros(len(walls)), o.yaw]),
+        times,
+        points,
+        np.zeros(len(arena.tours), np.int64),
+        no_relief() if arena.ground is None else arena.ground.relief,
+    )
+    return solids, [name for name, _, _ in walls] + [arena.name_of(i) for i in range(len(o))]
+
+
+def greatest_speed(solids: Solids) -> float:
+    """Return how fast the fastest moving obstacle is [m/s]."""
+    fastest = 0.0
+    for times, points in zip(solids.times_s, solids.points, strict=True):
+        passed = times[1:][np.isfinite(times[1:])]
+        ways = np.hypot(*np.diff(points[: len(passed)], axis=0).T)
+        took = np.diff(passed)
+        if len(took):
+            fastest = max(fastest, float(np.max(ways / took)))
+    return fastest
+
+
+@kernel
+def room_among(solids: Solids, p: Vec, radius: float) -> float:
+    """Return a distance [m] that a sphere around the vehicle surely is from walls and obstacles."""
+    room: float = math.inf
+    for i in range(len(solids.shape)):
+        c, s = math.cos(solids.yaw[i]), math.sin(solids.yaw[i])
+        dx, dy = p[0] - solids.center[i, 0], p[1] - solids.center[i, 1]
+        x = max(0.0, abs(c * dx + s * dy) - solids.size[i, 0])
+        y = max(0.0, abs(c * dy - s * dx) - solids.size[i, 1])
+        z = max(0.0, abs(p[2] - solids.center[i, 2]) - solids.size[i, 2])
+        room = min(room, math.sqrt(x * x + y * y + z * z))
+    return room - radius
