@@ -20,7 +20,6 @@ from airl_mav.core.compiling import COMPILING, heard_compiling
 from airl_mav.core.errors import EXIT_INTERRUPTED, FieldError, UsageError
 from airl_mav.core.first_start import compile_shown
 from airl_mav.profiles.vehicle import load_vehicle
-from airl_mav.scenario.compile_plans import vectorized_plan
 from airl_mav.training.progress import Exported, TrainingBar
 from airl_mav.training.request import TrainRequest
 
@@ -63,6 +62,9 @@ def run(
     config = options.configured()
     vehicle = load_vehicle(config.environment.vehicle)
     kind = config.environment.camera.of(vehicle.camera).kind
+    # Imported late: it needs an arena, which a light installation has not, and `--help` not.
+    from airl_mav.scenario.compile_plans import vectorized_plan
+
     compile_shown([vectorized_plan(kind, recorded=False)])
     bound, injections = speed_bound(config.environment), injections_of(config.environment.delay)
     signal.signal(signal.SIGTERM, signal.default_int_handler)

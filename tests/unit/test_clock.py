@@ -206,7 +206,7 @@ def test_only_the_clock_reads_the_hosts_time() -> None:
     assert offenders(found) == {}
 
 
-LEARNER_STATE = ROOT / "airl_mav" / "training" / "learner_state.py"
+LEARNER_STATE = ROOT / "airl_mav" / "training" / "checkpoint.py"
 """Draws nothing: saves and restores the global generators, which stable-baselines3 draws from."""
 
 
