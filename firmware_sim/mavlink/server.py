@@ -207,7 +207,8 @@ class MavlinkServer:
         share = _share([len(names) for _, names in due])
         for client, names in due:
             link = client.link
-            if link.scheduler.fast_us <= now_us:
+            fast = link.scheduler.fast_us <= now_us
+            if fast:
                 state = state or port.state()
                 context = context_of(state) if context is None else context
                 link.stream_fast(flown, times_us, context, most)
@@ -215,7 +216,7 @@ class MavlinkServer:
                 _stream_news(client, texts, now_us)
             if len(names) > share:
                 names, client.late = names[:share], names[share:]
-            if names or client.announced_origin is None:
+            if names or fast or client.announced_origin is None:
                 # Not in every tick: the snapshot costs more than asking the schedulers.
                 state = state or port.state()
                 if state.origin is not None and state.origin != client.announced_origin:

@@ -362,9 +362,9 @@ def wander(rig: Rig, seconds: float, seed: int) -> Log:
             v = rng.uniform([-4, -4, -1], [4, 4, 1])
             v -= [0.05, 0.05, 0.3] * (rig.truth.position - [0, 0, -8])
             rig.stream(velocity_setpoint(*v, yaw=rng.uniform(-3.1, 3.1)))
+        rig.tick()
         truth = rig.truth
         biases = rig.sim.plant.record["gyro_bias"][0], rig.sim.plant.record["accel_bias"][0]
-        rig.tick()
         if tick % 50:
             continue
         e = rig.ap.state().estimate

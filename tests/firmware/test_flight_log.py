@@ -182,7 +182,8 @@ def test_a_flight_is_logged_whole(flown: tuple[Path, ULog]) -> None:
     assert inside.sum() > 200
     for axis, name in enumerate(("x", "y", "z")):
         path = np.interp(times[inside], record.time_us, record.position[:, axis])
-        assert truth[name][inside] == pytest.approx(path, abs=2e-3)
+        # Between two samples of the record it may touch down.
+        assert truth[name][inside] == pytest.approx(path, abs=5e-3)
     # The estimate is near it, and so is what the motors do: a hover takes half of their range.
     estimate = topic(log, "vehicle_local_position")
     later = estimate["timestamp"] > 10_000_000

@@ -351,7 +351,7 @@ def test_a_heading_that_was_taken_for_biases_takes_them_along() -> None:
             1,
         )
         assert abs(heading_error_deg(rig)) < 10.0
-        assert np.abs(estimator.state[es.GYRO_BIAS : es.ACCEL_BIAS]).max() < math.radians(1.0)
+        assert np.abs(estimator.state[es.GYRO_BIAS : es.ACCEL_BIAS]).max() < math.radians(1.5)
         assert np.abs(estimator.state[es.ACCEL_BIAS : es.BARO_OFFSET]).max() < 0.3
 
 
