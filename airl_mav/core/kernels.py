@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
+import os
 import re
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -13,6 +15,7 @@ from typing import Any, TypeVar, cast
 import numba
 from numba import njit
 from numba.core import event
+from numba.core.caching import FunctionCache
 
 from airl_mav.core.cache import writable_folder
 from airl_mav.core.compiling import report_compiling
@@ -160,8 +163,29 @@ def sources() -> list[Path]:
 def _compiled(function: F, *, forceinline: bool, counts: bool = True) -> F:
     kernel_files.add(function.__code__.co_filename)
     options = {"nogil": True, "error_model": "numpy", "forceinline": forceinline, "_nrt": counts}
+    compiled = njit(**options)(function)
     with _caching_in(cache_folder(function.__code__.co_filename)):
-        return cast(F, njit(cache=True, **options)(function))
+        compiled._cache = _Cache(function)
+    return cast(F, compiled)
+
+
+class _Cache(FunctionCache):  # type: ignore[misc]
+    """numba's cache of a function, written by one process at a time.
+
+    Without a lock, two processes that save a function for different types at the same time write
+    the same file. The index then names code of the wrong types, and running it ends the process.
+    """
+
+    def save_overload(self, sig: object, data: object) -> None:
+        """Save compiled code."""
+        self._impl.locator.ensure_cache_path()
+        descriptor = os.open(self.cache_path, os.O_RDONLY)
+        try:
+            with suppress(OSError):  # Some network file systems have no locks.
+                fcntl.flock(descriptor, fcntl.LOCK_EX)
+            super().save_overload(sig, data)
+        finally:
+            os.close(descriptor)
 
 
 class _Compiler(event.Listener):  # type: ignore[misc]

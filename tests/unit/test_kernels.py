@@ -148,3 +148,55 @@ def test_numba_refuses_a_borrowing_kernel_an_array_of_its_own() -> None:
         makes(3)
     with pytest.raises(TypingError, match=message):
         returns(np.ones(3))
+
+
+SAVES = """
+import sys
+import numpy as np
+from airl_mav.core import kernels
+from twofold import twofold
+
+values = [1, 1.0, 1j, np.float32(1.0)]
+save = kernels._Cache.save_overload
+
+def save_with_the_others(*arguments):
+    print("ready", flush=True)
+    sys.stdin.readline()
+    save(*arguments)
+
+kernels._Cache.save_overload = save_with_the_others
+for each in sys.argv[1:] or range(4):
+    print(twofold(values[int(each)]), *twofold.stats.cache_misses)
+"""
+
+
+def test_processes_that_save_a_kernel_for_several_types_keep_all(tmp_path: Path) -> None:
+    (tmp_path / "twofold.py").write_text(
+        "from airl_mav.core.kernels import kernel\n\n@kernel\ndef twofold(x):\n    return x + x\n"
+    )
+    root = str(Path(kernels.__file__).parents[2])
+
+    def start(*which: str) -> subprocess.Popen[str]:
+        return subprocess.Popen(
+            [sys.executable, "-c", SAVES, *which],
+            env={**os.environ, "PYTHONPATH": f"{root}{os.pathsep}{tmp_path}"},
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+
+    together = [start(str(k)) for k in range(4)]
+    for each in together:
+        assert each.stdout is not None
+        assert each.stdout.readline() == "ready\n"
+    for each in together:
+        assert each.stdin is not None
+        each.stdin.write("\n")
+        each.stdin.flush()
+    for each in together:
+        each.communicate(timeout=60)
+        assert each.returncode == 0
+    # They are found under their own types.
+    with start() as alone:
+        found, _ = alone.communicate(timeout=60)
+    assert found.split("\n")[:-1] == ["2", "2.0", "2j", "2.0"]
