@@ -83,7 +83,8 @@ def measure_ours() -> list[Result]:
     from airl_mav.camera.render import Mount
     from airl_mav.core.constants import TICK_S, TICK_US
     from airl_mav.envs.arenas import batch_of
-    from airl_mav.envs.cameras import lens_of, render_images
+    from airl_mav.envs.cameras import Eye, render_images
+    from airl_mav.envs.colour_images import lens_of
     from airl_mav.envs.fleet import Rules, Verdict, hover, new_fleet, vehicle_of
     from airl_mav.envs.flight import advance
     from airl_mav.profiles.arena import ArenaSpec
@@ -118,7 +119,10 @@ def measure_ours() -> list[Result]:
                 advance(fleet, arenas, ticks, vehicle, rules, None)
                 if camera:
                     render_images(
-                        fleet, arenas, fleet.verdict == Verdict.FLYING, mount, lens, images, None
+                        fleet,
+                        arenas,
+                        fleet.verdict == Verdict.FLYING,
+                        Eye(mount, lens, images, None),
                     )
                 seconds += time.process_time() - start
             # Only what was flown counts: some touch an obstacle before the stretch is over.

@@ -13,7 +13,7 @@ from airl_mav.arena.gates import openings_of
 from airl_mav.arena.generate import free_area_fraction
 from airl_mav.arena.geometry import Arena, Shape, Tour
 from airl_mav.arena.ground import STEEPEST
-from airl_mav.arena.zones import zone_of
+from airl_mav.arena.placement import zone_of
 from airl_mav.profiles.arena import ArenaSpec
 
 

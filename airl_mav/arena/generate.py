@@ -23,11 +23,10 @@ from airl_mav.arena.gates import (
 from airl_mav.arena.geometry import Arena, Bounds, Building, Obstacles, PlacedMesh, Tour
 from airl_mav.arena.ground import Ground
 from airl_mav.arena.passage import Hills, free_share, least_gap_m, passage_exists
-from airl_mav.arena.placement import TRIES, NoRoomError, place_all
+from airl_mav.arena.placement import TRIES, NoRoomError, draw_goal, place_all, zone_radius_m
 from airl_mav.arena.relief import draw_ground, stand_on
 from airl_mav.arena.rooms import Plan, draw_plan, room_walls, standing_on_the_floor
 from airl_mav.arena.tours import draw_tours
-from airl_mav.arena.zones import draw_goal, zone_radius_m
 from airl_mav.core.errors import UsageError
 from airl_mav.core.seeding import seeded
 from airl_mav.profiles.arena import OBSTACLES, ArenaSpec

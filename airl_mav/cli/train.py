@@ -20,8 +20,7 @@ from airl_mav.core.compiling import COMPILING, heard_compiling
 from airl_mav.core.errors import EXIT_INTERRUPTED, FieldError, UsageError
 from airl_mav.core.first_start import compile_shown
 from airl_mav.profiles.vehicle import load_vehicle
-from airl_mav.training.progress import Exported, TrainingBar
-from airl_mav.training.request import TrainRequest
+from airl_mav.training.request import Exported, TrainingBar, TrainRequest
 
 if TYPE_CHECKING:
     from airl_mav.view.ends import ViewRequest
@@ -54,7 +53,7 @@ def run(
 
     `command_line` is recorded on the card. Raises UsageError as `airl_mav.training.run.train`.
     """
-    from airl_mav.envs.delay import injections_of, speed_bound
+    from airl_mav.envs.stopping import injections_of, speed_bound
 
     asked = view_of(options)
     voice = Voice(options, "airl train", console)
@@ -65,7 +64,7 @@ def run(
     # Imported late: it needs an arena, which a light installation has not, and `--help` not.
     from airl_mav.scenario.compile_plans import vectorized_plan
 
-    compile_shown([vectorized_plan(kind, recorded=False)])
+    compile_shown([vectorized_plan(kind)])
     bound, injections = speed_bound(config.environment), injections_of(config.environment.delay)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     # Imported late: the learner takes two seconds to load, and a typo must not wait for it.

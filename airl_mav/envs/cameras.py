@@ -11,21 +11,20 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.camera.fisheye import bent_of
 from airl_mav.camera.frame import MAX_MM, MM_PER_M
+from airl_mav.camera.imaging import ImageFormation
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.noise import DepthNoise, noise_of, noisy_frame
-from airl_mav.camera.projection import Bent
 from airl_mav.camera.raycast import render_depth
-from airl_mav.camera.render import Mount, camera_pose
+from airl_mav.camera.render import Motion, Mount, camera_pose
 from airl_mav.core.constants import TICK_US, US_PER_S
-from airl_mav.core.kernels import kernel
+from airl_mav.core.kernels import kernel, large_kernel
 from airl_mav.core.streams import Stream, stream
 from airl_mav.envs.arenas import ArenaBatch, move_obstacles, relief_of
-from airl_mav.envs.colour_images import ColourImages, Looks
-from airl_mav.envs.faults import BEFORE_US, TwinFault, later_us, twin_faults
-from airl_mav.envs.fleet import Fleet
-from airl_mav.envs.formed_images import FormedImages
+from airl_mav.envs.colour_images import ColourImages, Lens, Looks, lens_of
+from airl_mav.envs.decision import FrameTimes
+from airl_mav.envs.faults import delays_of, later_us, twin_faults
+from airl_mav.envs.fleet import Fleet, Seen
 from airl_mav.envs.meshes import MeshBatch, MeshesSeen, meshes_in
 from airl_mav.envs.saved_state import Stateful
 from airl_mav.faults.kinds import NOISE_SEED
@@ -33,31 +32,18 @@ from airl_mav.faults.model import Fault
 from airl_mav.profiles.camera import Camera
 from airl_mav.profiles.conditions import SensorNoise
 
-NEVER = 1 << 40
-"""More ticks than any flight has."""
+NEVER_US = 1 << 50
+"""Later than any flight ends [µs]."""
 
 
-class Lens(NamedTuple):
-    """The camera's constants; a tuple, so that compiled loops take it."""
+class Eye(NamedTuple):
+    """A depth camera of n vehicles, as kernels take it."""
 
-    focal: float
-    """Focal length [px] of a pinhole, columns for an angle [px/rad] of a cylinder."""
-    cx: float
-    """Column of the optical axis [px]; pixel centres are at whole numbers."""
-    cy: float
-    """Row of the optical axis [px]."""
-    range_m: float
-    """Greatest depth that gives a return [m]."""
-    cylindrical: bool = False
-    """The image is a cylinder's."""
-    bent: Bent | None = None
-    """The rays of a fisheye."""
-
-
-def lens_of(intrinsics: Intrinsics, range_m: float) -> Lens:
-    """Return the lens of a camera that sees `range_m` [m] far."""
-    k = intrinsics
-    return Lens(k.focal, k.cx, k.cy, range_m, k.cylindrical, bent_of(k))
+    mount: Mount
+    lens: Lens
+    image: NDArray[Any]
+    """(n, h, w) newest depth images [mm]."""
+    meshes: MeshBatch | None
 
 
 class Eyes:
@@ -85,14 +71,26 @@ class Eyes:
         if self.intrinsics.kind != "depth":
             assert looks is not None  # noqa: S101 - whoever makes colour cameras has arenas for them
             self._colour = ColourImages(self.intrinsics, self._mount, looks, self._meshes)
-        self._formed: FormedImages | None = None
-        """None: the cameras have no table `imaging`."""
+        self._formed: ImageFormation | None = None
+        """Takes images one by one, as the rehearsal does; None: the camera has no `imaging`.
+
+        Nothing outlasts an image (`conditions.check_twin_imaging`): it serves all vehicles."""
         if camera.imaging is not None and looks is not None:
-            self._formed = FormedImages(camera, looks, name)
+            self._formed, self._looks = ImageFormation(camera, name), looks
+
+    @property
+    def eye(self) -> Eye | None:
+        """What kernels render by; None where there is more to an image than depth."""
+        if self._formed is not None or self._colour is not None or self._noise is not None:
+            return None
+        return self._eye(self.image)
+
+    def _eye(self, image: NDArray[Any]) -> Eye:
+        return Eye(self._mount, self._lens, image, self._meshes.by_depth)
 
     def take(
         self,
-        fleet: Fleet,
+        fleet: Fleet | Seen,
         arenas: ArenaBatch,
         who: NDArray[np.bool_],
         seeds: NDArray[np.int64],
@@ -111,9 +109,14 @@ class Eyes:
         """
         image: NDArray[Any] = self.image if out is None else out
         if self._formed is not None:
-            self._formed.render(fleet, who, seeds, frames, image)
+            poses = (fleet.position, fleet.quaternion, fleet.velocity, fleet.omega)
+            for i in np.flatnonzero(who).tolist():
+                motion, numbers = Motion(*(each[i] for each in poses)), (seeds[i], frames[i])
+                arena, elapsed_us = self._looks.arenas[i], int(fleet.time_us[i])
+                formed = self._formed.take(arena, elapsed_us, motion, *map(int, numbers))
+                image[i] = formed.image
         elif self._colour is None:
-            render_images(fleet, arenas, who, self._mount, self._lens, image, self._meshes.by_depth)
+            render_images(fleet, arenas, who, self._eye(image))
         else:
             self._colour.render(fleet, arenas, who, image)
         if self._noise is not None:
@@ -156,16 +159,13 @@ class Cameras(Stateful):
             for name, each in (further or {}).items()
         }
         """Those that are triggered with the main one, by name."""
-        tables = [each.imaging for each in (camera, *(further or {}).values())]
-        self.exposed_in_motion = any(
-            table is not None and (table.exposure_ms or table.readout_ms) for table in tables
-        )
-        """Whether any image depends on how its vehicle moves when it is taken."""
-        self.period_us = camera.period_us
-        self.transport_us = transport_us
-        self._first_us = np.zeros(n, np.int64)
         failing = twin_faults(faults, "camera")
         self._late = [each for each in failing if each.fault.kind == "delay"]
+        self._first_us = np.zeros(n, np.int64)
+        self.times = FrameTimes(
+            self._first_us, camera.period_us, transport_us, delays_of(self._late)
+        )
+        """When frames are taken and decoded."""
         self._changed = [each for each in failing if each.fault.kind != "delay"]
         """What changes pictures, in the order of the episode's faults."""
         stuck = [each.number for each in failing if each.fault.kind == "stuck"]
@@ -188,66 +188,42 @@ class Cameras(Stateful):
     def latest_us(self) -> int:
         """Longest time from capture to decoded [µs]."""
         late_s = sum(each.fault.amount for each in self._late)
-        return self.transport_us + round(late_s * US_PER_S)
+        return self.times.transport_us + round(late_s * US_PER_S)
+
+    @property
+    def eye(self) -> Eye | None:
+        """What kernels render by; None where there is more to an image than depth."""
+        if self._changed or self.further:
+            return None
+        return self._main.eye
 
     def begin(self, i: int, seed: int) -> None:
         """Start the episode of slot i."""
-        self._first_us[i] = -int(stream(seed, Stream.CAMERA).random() * self.period_us)
+        self._first_us[i] = -int(stream(seed, Stream.CAMERA).random() * self.times.period_us)
         for each in self._changed:
             if each.number in self._frozen:
                 # The first frame after its begin; of the start there is one, whenever it was taken.
                 since_us = each.from_us - int(self._first_us[i])
-                wait_us = -since_us % self.period_us if each.from_us else 0
+                wait_us = -since_us % self.times.period_us if each.from_us else 0
                 self._freeze_us[each.number][i] = each.from_us + wait_us
-
-    def age_us(self, time_us: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return how old the newest decoded frame is at a time (n,) [µs] of each episode."""
-        since_us = time_us - self.transport_us - self._first_us
-        age: NDArray[np.int64] = self.transport_us + since_us % self.period_us
-        for late in self._late:
-            age = self._delayed(age, time_us, late)
-        return age
 
     def delay_us(self, capture_us: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return by how much frames come later that were taken at a time (n,) [µs]."""
         return later_us(self._late, capture_us)
-
-    def _delayed(
-        self, age_us: NDArray[np.int64], time_us: NDArray[np.int64], late: TwinFault
-    ) -> NDArray[np.int64]:
-        """Return the age of the newest frame where those of a time come later, all in order."""
-        delay_us = round(late.fault.amount * US_PER_S)
-
-        def newest(at_us: Any) -> Any:
-            return at_us - (at_us - self._first_us) % self.period_us
-
-        healthy = time_us - age_us
-        last = newest(late.to_us - 1)
-        # A frame of after the fault waits for the last one of it.
-        waits = (healthy >= late.from_us) & (time_us - self.transport_us < last + delay_us)
-        arrived = newest(time_us - self.transport_us - delay_us)
-        if late.from_us != BEFORE_US:
-            arrived = np.maximum(arrived, newest(late.from_us - 1))
-        found: NDArray[np.int64] = time_us - np.where(waits, arrived, healthy)
-        return found
 
     @property
     def may_freeze(self) -> bool:
         """Whether any camera may be stuck."""
         return bool(self._freeze_us)
 
-    def ticks_to_freeze(self, time_us: NDArray[np.int64]) -> NDArray[np.int64] | None:
-        """Return the ticks (n,) until the next picture is kept, after these times [µs].
-
-        None: no camera is ever stuck.
-        """
+    def next_freeze_us(self, time_us: NDArray[np.int64]) -> NDArray[np.int64] | None:
+        """Return when the next picture is kept (n,), after these times; None: none ever is."""
         if not self._freeze_us:
             return None
-        due = np.stack(
-            [(at - time_us + TICK_US // 2) // TICK_US for at in self._freeze_us.values()]
-        )
-        ticks: NDArray[np.int64] = np.where(due > 0, due, NEVER).min(axis=0)
-        return ticks
+        ticks = [(at - time_us + TICK_US // 2) // TICK_US for at in self._freeze_us.values()]
+        due = [np.where(each > 0, time_us + each * TICK_US, NEVER_US) for each in ticks]
+        soonest: NDArray[np.int64] = np.minimum.reduce(due)
+        return soonest
 
     def freeze(
         self,
@@ -262,15 +238,9 @@ class Cameras(Stateful):
                 frames = self._frames(fleet.time_us)
                 self._main.take(fleet, arenas, who, seeds, frames, self._frozen[number])
 
-    def next_decoded_us(self, time_us: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return when the next frame is decoded after a time (n,) [µs] of each episode."""
-        since_us = (time_us - self.transport_us - self._first_us) % self.period_us
-        decoded: NDArray[np.int64] = time_us - since_us + self.period_us
-        return decoded
-
     def capture(
         self,
-        fleet: Fleet,
+        fleet: Fleet | Seen,
         arenas: ArenaBatch,
         who: NDArray[np.bool_],
         seeds: NDArray[np.int64],
@@ -295,7 +265,9 @@ class Cameras(Stateful):
     def _frames(self, time_us: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return the numbers (n,) of frames that are taken at these times (n,) [µs]."""
         # They are taken at whole ticks, up to half of one before their time.
-        frames: NDArray[np.int64] = (time_us + TICK_US // 2 - self._first_us) // self.period_us
+        frames: NDArray[np.int64] = (
+            time_us + TICK_US // 2 - self._first_us
+        ) // self.times.period_us
         return frames
 
     def _held(self) -> Mapping[str, Any]:
@@ -318,15 +290,9 @@ def _make_noisy(
         image[i] = noisy_frame(image[i], noise, int(seeds[i]), int(frames[i]))
 
 
-@kernel
+@large_kernel
 def render_images(
-    fleet: Fleet,
-    arenas: ArenaBatch,
-    who: NDArray[np.bool_],
-    mount: Mount,
-    lens: Lens,
-    out: NDArray[np.uint16],
-    meshes: MeshBatch | None,
+    fleet: Fleet | Seen, arenas: ArenaBatch, who: NDArray[np.bool_], eye: Eye
 ) -> None:
     """Render the depth image of every vehicle in `who`, from where it is now.
 
@@ -334,19 +300,17 @@ def render_images(
         fleet: Poses and times.
         arenas: One a vehicle; moving obstacles are put where they are at its time.
         who: (n,) whose image is rendered; the others' stays as it is.
-        mount: The camera's place on the body.
-        lens: The camera.
-        out: (n, height, width) depth [mm], written; 0 = no return. Rounded and clipped as
+        eye: The camera. Its image is written: depth [mm], 0 = no return, rounded and clipped as
             `camera.frame.depth_to_z16` does.
-        meshes: Those of the arenas; None: there are none.
     """
-    image = np.empty(out.shape[1:], np.float32)
+    lens = eye.lens
+    image = np.empty(eye.image.shape[1:], np.float32)
     for i in range(len(who)):
         if not who[i]:
             continue
         move_obstacles(arenas, i, fleet.time_us[i])
         count = arenas.n_obstacles[i]
-        position, quaternion = camera_pose(fleet.position[i], fleet.quaternion[i], mount)
+        position, quaternion = camera_pose(fleet.position[i], fleet.quaternion[i], eye.mount)
         render_depth(
             image,
             position,
@@ -361,10 +325,10 @@ def render_images(
             arenas.center[i, :count],
             arenas.half_size[i, :count],
             arenas.yaw[i, :count],
-            None if meshes is None else meshes_in(meshes, i, count, relief_of(arenas, i)),
+            meshes_in(eye.meshes, i, count, relief_of(arenas, i)),
             lens.bent,
         )
-        _to_z16(image, out[i])
+        _to_z16(image, eye.image[i])
 
 
 @kernel

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,7 +23,7 @@ from airl_mav.camera.textures import atlas
 from airl_mav.core.errors import UsageError
 from airl_mav.core.kernels import kernel
 from airl_mav.envs.arenas import ArenaBatch, copy_rows, move_obstacles, relief_of
-from airl_mav.envs.fleet import Fleet
+from airl_mav.envs.fleet import Fleet, Seen
 from airl_mav.envs.meshes import MeshBatch, MeshesSeen, meshes_in
 from airl_mav.profiles.image_file import ImageFile
 
@@ -136,11 +136,38 @@ class Looks:
             self.rain = rain = larger
         rain.present[i], rain.drops[i, : len(drops)] = len(drops), drops
 
-    def restore(self, arenas: Sequence[Arena | None]) -> None:
-        """Take the looks of all slots again; None: no episode has begun there."""
-        for i, arena in enumerate(arenas):
-            if arena is not None:
-                self.put(i, arena)
+
+class Lens(NamedTuple):
+    """The camera's constants; a tuple, so that compiled loops take it."""
+
+    focal: float
+    """Focal length [px] of a pinhole, columns for an angle [px/rad] of a cylinder."""
+    cx: float
+    """Column of the optical axis [px]; pixel centres are at whole numbers."""
+    cy: float
+    """Row of the optical axis [px]."""
+    range_m: float
+    """Greatest depth that gives a return [m]."""
+    cylindrical: bool = False
+    """The image is a cylinder's."""
+    bent: Bent | None = None
+    """The rays of a fisheye."""
+
+
+def lens_of(intrinsics: Intrinsics, range_m: float) -> Lens:
+    """Return the lens of a camera that sees `range_m` [m] far."""
+    k = intrinsics
+    return Lens(k.focal, k.cx, k.cy, range_m, k.cylindrical, bent_of(k))
+
+
+class Canvas(NamedTuple):
+    """Room to work in for an image (h, w, ...)."""
+
+    work: Work
+    rgb: NDArray[np.uint8]
+    dry: NDArray[np.uint8]
+    depth: NDArray[np.float32]
+    seen: NDArray[np.int32]
 
 
 class ColourImages:
@@ -150,49 +177,34 @@ class ColourImages:
         self, intrinsics: Intrinsics, mount: Mount, looks: Looks, meshes: MeshesSeen
     ) -> None:
         """Take the camera, its place on the body, how the arenas look, and their meshes."""
-        k = intrinsics
-        self._lens, self._bent = (k.focal, k.cx, k.cy, k.cylindrical), bent_of(k)
+        k, shape = intrinsics, (intrinsics.height, intrinsics.width)
+        self._lens = lens_of(k, math.inf)
         self._mount, self._looks, self._meshes = mount, looks, meshes
-        self._work = Work.of(k.width, k.height, k.cylindrical)
-        shape = (k.height, k.width)
-        self._rgb, self._dry = np.zeros((2, *shape, 3), np.uint8)
-        self._depth, self._seen = np.zeros(shape, np.float32), np.zeros(shape, np.int32)
+        rgb, dry = np.zeros((2, *shape, 3), np.uint8)
+        depth, seen = np.zeros(shape, np.float32), np.zeros(shape, np.int32)
+        work = Work.of(k.width, k.height, k.cylindrical)
+        self._canvas = Canvas(work, rgb, dry, depth, seen)
 
     def render(
-        self, fleet: Fleet, arenas: ArenaBatch, who: NDArray[np.bool_], out: NDArray[Any]
+        self, fleet: Fleet | Seen, arenas: ArenaBatch, who: NDArray[np.bool_], out: NDArray[Any]
     ) -> None:
         """Write the images (n, h, w, 3), or (n, h, w, 1) in grey, of the vehicles in `who` (n,)."""
-        render_colour_images(
-            fleet,
-            arenas,
-            self._looks.batch,
-            self._looks.gloss,
-            self._looks.rain,
-            self._meshes.batch,
-            who,
-            self._mount,
-            *self._lens,
-            self._work,
-            self._rgb,
-            self._depth,
-            self._seen,
-            self._dry,
-            LIGHT_OF,
-            atlas(self._looks.images),
-            self._bent,
-            out,
-        )
+        looks, meshes = self._looks, self._meshes.batch
+        camera = (self._mount, self._lens, self._canvas, LIGHT_OF, atlas(looks.images))
+        _render(fleet, arenas, looks.batch, looks.gloss, looks.rain, meshes, who, *camera, out)
 
 
 @kernel
-def _gloss_in(gloss: GlossBatch, i: int, surfaces: int) -> Gloss:
+def _gloss_in(gloss: GlossBatch | None, i: int, surfaces: int) -> Gloss | None:
     """Return what the surfaces of arena i are."""
+    if gloss is None:
+        return None
     return Gloss(gloss.surface[i, :surfaces], gloss.alpha[i, :surfaces], gloss.lets[i, :surfaces])
 
 
 @kernel
-def render_colour_images(
-    fleet: Fleet,
+def _render(
+    fleet: Fleet | Seen,
     arenas: ArenaBatch,
     looks: LookBatch,
     gloss: GlossBatch | None,
@@ -200,46 +212,18 @@ def render_colour_images(
     meshes: MeshBatch | None,
     who: NDArray[np.bool_],
     mount: Mount,
-    focal: float,
-    cx: float,
-    cy: float,
-    cylindrical: bool,
-    work: Work,
-    rgb: NDArray[np.uint8],
-    depth: NDArray[np.float32],
-    seen: NDArray[np.int32],
-    dry: NDArray[np.uint8],
+    lens: Lens,
+    canvas: Canvas,
     light_of: NDArray[np.float32],
     patterns: NDArray[np.float32],
-    bent: Bent | None,
     out: NDArray[np.uint8],
 ) -> None:
     """Render the colour image of every vehicle in `who`, from where it is now.
 
-    Args:
-        fleet: Poses and times.
-        arenas: One a vehicle; moving obstacles are put where they are at its time.
-        looks: One an arena.
-        gloss: With `looks`; None: all surfaces are matt.
-        rain: Drops on the lenses; None: they are dry.
-        meshes: Those of the arenas; None: there are none.
-        who: (n,) whose image is rendered; the others' stays as it is.
-        mount: The camera's place on the body.
-        focal: Focal length [px], or columns for an angle of a cylinder [px/rad].
-        cx: Column of the optical axis [px].
-        cy: Row of the optical axis [px].
-        cylindrical: The image is a cylinder's.
-        work: Room to work in, with the next four.
-        rgb: (h, w, 3).
-        depth: (h, w).
-        seen: (h, w).
-        dry: (h, w, 3).
-        light_of: `image_sensor.LIGHT_OF`.
-        patterns: `textures.atlas()`.
-        bent: `fisheye.bent_of` the camera.
-        out: (n, h, w, channels) sRGB, or grey where there is one channel, written.
+    Moving obstacles are put where they are at its time. `out` (n, h, w, channels) is written: sRGB,
+    or grey where there is one channel.
     """
-    grey = out.shape[3] == 1
+    grey, rgb = out.shape[3] == 1, canvas.rgb
     for i in range(len(who)):
         if not who[i]:
             continue
@@ -250,32 +234,32 @@ def render_colour_images(
         image = rgb if grey else out[i]
         render_colour(
             image,
-            depth,
-            seen,
-            work,
+            canvas.depth,
+            canvas.seen,
+            canvas.work,
             position,
             quaternion,
-            focal,
-            cx,
-            cy,
-            cylindrical,
+            lens.focal,
+            lens.cx,
+            lens.cy,
+            lens.cylindrical,
             arenas.bounds[i],
             arenas.shape[i, :count],
             arenas.center[i, :count],
             arenas.half_size[i, :count],
             arenas.yaw[i, :count],
-            None if meshes is None else meshes_in(meshes, i, count, relief_of(arenas, i)),
+            meshes_in(meshes, i, count, relief_of(arenas, i)),
             looks.texture[i, :surfaces],
             looks.per_m[i, :surfaces],
             looks.offset[i, :surfaces],
             looks.albedo[i, :surfaces],
-            None if gloss is None else _gloss_in(gloss, i, surfaces),
+            _gloss_in(gloss, i, surfaces),
             looks.lights[i],
             patterns,
-            bent,
+            lens.bent,
         )
         if rain is not None and rain.present[i] > 0:
-            draw_drops(image, dry, rain.drops[i, : rain.present[i]], light_of)
+            draw_drops(image, canvas.dry, rain.drops[i, : rain.present[i]], light_of)
         if grey:
             pixels = rgb.shape[0] * rgb.shape[1]
             write_grey(out[i].reshape(pixels), rgb.reshape(pixels, 3))

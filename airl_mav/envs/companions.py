@@ -77,6 +77,11 @@ class Companions:
             kept[:, i] = 0
 
     @property
+    def account(self) -> bool:
+        """Whether they keep account of their decisions."""
+        return self._memory is not None
+
+    @property
     def remember(self) -> bool:
         """Whether they keep what they saw: their policies see it again."""
         return len(self._earlier) > 0 or any(map(len, self._further.values()))

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.core.errors import UsageError
-from airl_mav.envs.curriculum import CurriculumState
-from airl_mav.envs.delay import bounded
-from airl_mav.envs.fleet import Verdict
-from airl_mav.envs.navigation import Flights, Navigation
+from airl_mav.envs.episode_arenas import CurriculumState
+from airl_mav.envs.fleet import Flights, Verdict
+from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.rewards import Step, costs, reward_of
-from airl_mav.envs.spec import Costs, EnvironmentSpec, gymnasium_spec
+from airl_mav.envs.spec import SHIPPED_REWARDS, Costs, EnvironmentSpec, gymnasium_spec
+from airl_mav.envs.stopping import bounded
 from airl_mav.policy.action_sets import ActionSpec, commands, continuous_numbers, discrete_actions
 from airl_mav.policy.layouts import boxes
 from airl_mav.policy.observation_spec import ObservationSpec
@@ -28,22 +28,14 @@ LAST_TRAINING_SEED = 2**31
 MOST_SEED = 2**63 - 1
 """Greatest seed of an episode."""
 
+FLYING = int(Verdict.FLYING)
+"""`Verdict.FLYING` as a number, which numpy compares several times faster."""
+
 _FREE = Costs()
 """Nothing is charged."""
 
 UNBOUNDED = 1e6
 """Bound of what a layout leaves unbounded, in its units: Gymnasium's checker warns of infinity."""
-
-
-class Decided(NamedTuple):
-    """What a decision of n vehicles came to; arrays (n,)."""
-
-    flights: Flights
-    """At its end."""
-    reward: NDArray[np.float64]
-    terminated: NDArray[np.bool_]
-    truncated: NDArray[np.bool_]
-    """Ran out of time."""
 
 
 class Decisions:
@@ -57,6 +49,9 @@ class Decisions:
         """
         self.environment = bounded(gymnasium_spec(spec, knobs))
         self._reward = reward_of(self.environment.reward)
+        self._own = self.environment.reward not in SHIPPED_REWARDS
+        self._charged = self.environment.costs != _FREE
+        self._action_spec = self.environment.action_spec
         self.navigation = Navigation(self.environment, n)
         self.curriculum: CurriculumState | None = None
         if self.environment.curriculum is not None:
@@ -76,14 +71,12 @@ class Decisions:
     def _begin(self, slots: Sequence[int], seeds: Sequence[int]) -> Flights:
         """Begin episodes in the zone asked for, else that of the curriculum, else the whole."""
         self.navigation.begin(slots, seeds, self._present_zone)
-        before = self._before
-        if before is None:
-            self._before = self.navigation.flights()
-        else:
-            self._before = before.with_rows(slots, self.navigation.flights(slots))
+        self._before = self.navigation.flights()
         return self._before
 
-    def _decide(self, actions: Any, lead: tuple[int, ...]) -> Decided:
+    def _decide(
+        self, actions: Any, lead: tuple[int, ...]
+    ) -> tuple[Flights, NDArray[np.float64], NDArray[np.int64]]:
         """Fly one decision of every vehicle.
 
         Args:
@@ -94,34 +87,30 @@ class Decisions:
             ResetNeeded: Before the first reset.
             InvalidAction: Not so many actions of the set.
         """
-        before, spec = self._before, self.environment
+        before, navigation, costs_of = self._before, self.navigation, self.environment.costs
         if before is None:
             raise gym.error.ResetNeeded("step() before reset()")
-        action_spec = spec.action_spec
-        asked = checked_actions(action_spec, actions, lead)
-        chosen = commands(action_spec, asked if lead else asked[None])
-        charged = spec.costs != _FREE
-        by_rates = self.navigation.by_rates
-        level = chosen if by_rates else chosen[:, :3]
-        last = level
-        if charged:
-            flown = self.navigation.whole_truth().fleet.setpoint
-            last = flown.copy() if by_rates else flown[:, (0, 1, 3)]
-        self.navigation.fly(chosen)
-        now = self._before = self.navigation.flights()
-        # What had ended before has not been flown.
-        ended = (now.verdict != Verdict.FLYING) & (before.verdict == Verdict.FLYING)
-        truncated: NDArray[np.bool_] = ended & (now.verdict == Verdict.TIMEOUT)
-        terminated = ended & ~truncated
+        asked = checked_actions(self._action_spec, actions, lead)
+        chosen = commands(self._action_spec, asked if lead else asked[None])
+        last = None
+        if self._charged:
+            flown = navigation.fleet.setpoint
+            last = flown.copy() if navigation.by_rates else flown[:, (0, 1, 3)]
+        navigation.fly(chosen, encode=True)
+        now = self._before = navigation.flights()
+        reward, ending = navigation.paid, navigation.ending
+        if self._own or last is not None:
+            level = chosen if navigation.by_rates else chosen[:, :3]
+            step = Step(before, now, level, self.environment.episode.hold_s)
+            if self._own:
+                reward = self._reward(step)
+            if last is not None:
+                reward = reward - costs(costs_of, last, step)
         if self.curriculum is not None:
-            for i in np.flatnonzero(ended):
+            for i in np.flatnonzero(ending):
                 success = bool(now.verdict[i] == Verdict.SUCCESS)
-                self.curriculum.record(int(self.navigation.zones[i]), success=success)
-        step = Step(before, now, level, spec.episode.hold_s)
-        reward = self._reward(step)
-        if charged:
-            reward = reward - costs(spec.costs, last, step)
-        return Decided(now, reward, terminated, truncated)
+                self.curriculum.record(int(navigation.zones[i]), success=success)
+        return now, reward, ending
 
     def _quality(self, flights: Flights) -> dict[str, NDArray[Any]]:
         """Return `info` of every flight: its seed, zone and quality so far."""

@@ -13,10 +13,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.core.streams import Stream, stream
+from airl_mav.core.constants import TICK_US
+from airl_mav.core.frames import Vector
+from airl_mav.core.streams import Stream, sensors_and_gusts, stream
+from airl_mav.envs.faults import gusts, lasting, twin_faults
+from airl_mav.envs.fleet import Fleet, Verdict
 from airl_mav.envs.saved_state import State, Stateful
+from airl_mav.faults.model import Fault
 from airl_mav.latency.injection import Injection
 from airl_mav.latency.samplers import LatencySampler, latency_generator
+from airl_mav.profiles.conditions import WindSettings
+from airl_mav.vehicle.wind import BLOCK as WIND_BLOCK
+from airl_mav.vehicle.wind import Wind, wind_of_episode
 
 BLOCK = 32
 """Number of decisions that are drawn at a time."""
@@ -81,7 +89,8 @@ class DelayDraws(DrawnAhead):
         self._native_us = native_us
         self._draw = draw
         self._samplers: list[LatencySampler | None] = [None] * n
-        self._block = np.full((n, BLOCK), native_us, np.int64)
+        self.block = np.full((n, BLOCK), native_us, np.int64)
+        """(n, BLOCK) t2 of the present decisions [µs]: of decision k in column k % BLOCK."""
 
     def begin(self, i: int, seed: int) -> None:
         """Start the episode of slot i. The companion draws the same latencies from this seed."""
@@ -93,19 +102,62 @@ class DelayDraws(DrawnAhead):
             if injection.latency is None
             else injection.sampler(latency_generator(seed, self._draw))
         )
-        self._block[i] = self._native_us
+        self.block[i] = self._native_us
 
-    def take(self, decision: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return t2 (n,) [µs] of each slot's `decision`, counted from 0, one after the other."""
+    def draw(self, decision: NDArray[np.int64]) -> None:
+        """Draw the block of each slot whose `decision` (n,), counted from 0, begins one."""
         for i in np.flatnonzero(decision % BLOCK == 0):
             self._draw_block(int(i))
-        picked: NDArray[np.int64] = self._block.take(
-            np.arange(len(decision)) * BLOCK + decision % BLOCK
-        )
-        return picked
 
     def _draw_block(self, i: int) -> None:
         sampler = self._samplers[i]
         if sampler is not None:
-            self._block[i] = [sampler.sample_us() for _ in range(BLOCK)]
+            self.block[i] = [sampler.sample_us() for _ in range(BLOCK)]
+            self._blocks[i] += 1
+
+
+class Winds(DrawnAhead):
+    """The wind of n episodes; from the seed of each the same history of gusts as the plant's."""
+
+    def __init__(self, n: int, settings: WindSettings, faults: Sequence[Fault] = ()) -> None:
+        """Prepare n slots; what is added by `faults` of the wind blows in all of them."""
+        super().__init__(n)
+        self._faults = twin_faults(faults, "wind")
+        still = not (set(settings.model_dump(exclude={"gust_time_s"}).values()) - {0.0})
+        self.calm = still and not self._faults
+        """Whether no wind blows in any episode."""
+        self._settings = settings
+        self.gusty = settings.gust_m_s > 0.0 or bool(self._faults)
+        self._winds: list[Wind | None] = [None] * n
+        self.air = np.zeros((n, WIND_BLOCK if self.gusty else 0 if self.calm else 1, 3))
+        """(n, k, 3) as `flight.advance` takes it: the present blocks."""
+
+    def begin(self, i: int, seed: int) -> Vector:
+        """Start the episode of slot i; return its steady wind (3,) NED [m/s]."""
+        if self.calm:
+            return np.zeros(3)
+        rng = sensors_and_gusts(np.random.default_rng(seed))[1]
+        wind = Wind(wind_of_episode(self._settings, seed), rng)
+        self._winds[i], self._seeds[i], self._blocks[i] = wind, seed, 0
+        self._draw_block(i)
+        return wind.steady + lasting(self._faults) if self._faults else wind.steady
+
+    def ends_us(self) -> NDArray[np.int64] | None:
+        """Return when the present blocks end (n,); None: the wind is steady."""
+        return self._blocks * WIND_BLOCK * TICK_US if self.gusty else None
+
+    def blow(self, fleet: Fleet) -> None:
+        """Draw the next blocks of the flights that have come to the end of theirs."""
+        ends_us = self.ends_us()
+        if ends_us is not None:
+            due = (fleet.verdict == Verdict.FLYING) & (fleet.time_us >= ends_us)
+            for i in np.flatnonzero(due).tolist():
+                self._draw_block(i)
+
+    def _draw_block(self, i: int) -> None:
+        wind = self._winds[i]
+        if wind is not None:
+            self.air[i] = wind.ahead()
+            if self._faults:
+                self.air[i] += gusts(self._faults, int(self._blocks[i]) * WIND_BLOCK, WIND_BLOCK)
             self._blocks[i] += 1

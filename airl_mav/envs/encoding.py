@@ -5,12 +5,100 @@
 
 from __future__ import annotations
 
+import math
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.camera.frame import MM_PER_M
 from airl_mav.core.kernels import kernel
-from airl_mav.envs.scanning import COMPILED_SCANNING
+from airl_mav.envs.fleet import Fleet
 from airl_mav.policy.images import Bytes, Shrink
+from airl_mav.policy.layouts import DISTANCE_SCALE_M, LEAST_DISTANCE_M, SPEED_SCALE_M_S
+from airl_mav.policy.scans import (
+    BAND_M,
+    NEAREST_M,
+    WIDEST_RAD,
+    Floats,
+    Moved,
+    Rays,
+    Scanning,
+    Tilt,
+    goes_round,
+)
+from airl_mav.vehicle.rotation import Quat, Vec, multiply, yaw_of
+
+
+def level_scan(depth_mm: NDArray[np.uint16], rays: Rays, tilt: Tilt, bearings: int) -> Floats:
+    """Return what `policy.scans.level_scan` returns."""
+    found = np.full((len(depth_mm), bearings), np.inf)
+    _level_scan(np.ascontiguousarray(depth_mm), rays, tilt, goes_round(rays.fov_rad), found)
+    return found
+
+
+def carried(scans: Floats, moved: Moved, fov_rad: float) -> Floats:
+    """Return what `policy.scans.carried` returns."""
+    found = np.full(scans.shape, np.inf)
+    _carry(scans, moved, fov_rad, goes_round(fov_rad), found)
+    return found
+
+
+COMPILED_SCANNING = Scanning(level_scan, carried)
+"""As the batch twin does it."""
+
+
+@kernel
+def _level_scan(
+    depth_mm: NDArray[np.uint16], rays: Rays, tilt: Tilt, whole: bool, found: Floats
+) -> None:
+    bearings = found.shape[1]
+    share = bearings / rays.fov_rad
+    for i in range(len(depth_mm)):
+        sr, cr = tilt.sin_roll[i], tilt.cos_roll[i]
+        sp, cp = tilt.sin_pitch[i], tilt.cos_pitch[i]
+        for v in range(depth_mm.shape[1]):
+            for u in range(depth_mm.shape[2]):
+                if depth_mm[i, v, u] == 0:
+                    continue
+                depth = depth_mm[i, v, u] / MM_PER_M
+                ahead, right = depth * rays.forward[u], depth * rays.right[u]
+                down = depth * rays.down[v]
+                below = sr * right + cr * down
+                if abs(cp * below - sp * ahead) > BAND_M:
+                    continue
+                level_right, level_ahead = cr * right - sr * down, cp * ahead + sp * below
+                angle = math.atan2(level_right, level_ahead) + 0.5 * rays.fov_rad
+                bearing = math.floor(angle * share)
+                if whole:
+                    bearing %= bearings
+                if 0 <= bearing < bearings:
+                    distance = math.sqrt(level_ahead * level_ahead + level_right * level_right)
+                    found[i, bearing] = min(found[i, bearing], distance)
+
+
+@kernel
+def _carry(scans: Floats, moved: Moved, fov_rad: float, whole: bool, found: Floats) -> None:
+    bearings = scans.shape[1]
+    step = fov_rad / bearings
+    for i in range(len(scans)):
+        for bearing in range(bearings):
+            distance = scans[i, bearing]
+            if not math.isfinite(distance):
+                continue
+            angle = (bearing + 0.5) * step - 0.5 * fov_rad - moved.turned_rad[i]
+            ahead = distance * math.cos(angle) + moved.forward_m[i]
+            right = distance * math.sin(angle) + moved.right_m[i]
+            now = math.sqrt(ahead * ahead + right * right)
+            half = min(0.5 * step * distance / max(now, NEAREST_M), WIDEST_RAD)
+            angle = math.atan2(right, ahead) + 0.5 * fov_rad
+            middle = math.floor(angle / step)
+            first = min(math.ceil((angle - half) / step - 0.5), middle)
+            last = max(math.floor((angle + half) / step - 0.5), middle)
+            for covered in range(first, last + 1):
+                at = covered % bearings if whole else covered
+                if 0 <= at < bearings:
+                    found[i, at] = min(found[i, at], now)
 
 
 def shrink_depth(
@@ -109,3 +197,56 @@ def _to_bytes(
     for u in range(len(depths)):
         ratio = most * (np.float32(np.uint16(depths[u] - less)) + one) / far
         out[u] = np.uint8(np.rint(ratio if ratio < most else most))
+
+
+class EncodedBody(NamedTuple):
+    """The arrays of the layout `body` of a depth image, of n vehicles."""
+
+    depth: NDArray[np.uint8]  # (n, h, w)
+    velocity: NDArray[np.float32]  # (n, 3)
+    goal: NDArray[np.float32]  # (n, 3)
+
+
+@kernel
+def encode_body(
+    fleet: Fleet,
+    errors: NDArray[np.float64],
+    depth_mm: NDArray[np.uint16],
+    goal: NDArray[np.float64],
+    bytes_of: Bytes,
+    out: EncodedBody,
+) -> None:
+    """Write what networks see of n vehicles, as `observe` and `encode_layout` make it.
+
+    `errors` (n, 9) are those of telemetry, `depth_mm` (n, h, w) the newest images, and `goal` is
+    (n, 3) `ArenaBatch.goal`.
+    """
+    _shrink(depth_mm, bytes_of.table, bytes_of.far_mm, out.depth)
+    for i in range(len(errors)):
+        q, e = fleet.quaternion[i], errors[i]
+        cos, sin = heading_told((q[0], q[1], q[2], q[3]), (e[6], e[7], e[8]))
+        here = fleet.position[i]
+        north, east = goal[i, 0] - (here[0] + e[0]), goal[i, 1] - (here[1] + e[1])
+        ahead, right = cos * north + sin * east, cos * east - sin * north
+        distance = math.hypot(ahead, right)
+        safe = max(distance, LEAST_DISTANCE_M)
+        out.goal[i, 0], out.goal[i, 1] = ahead / safe, right / safe
+        out.goal[i, 2] = distance / DISTANCE_SCALE_M
+        north, east = fleet.velocity[i, 0] + e[3], fleet.velocity[i, 1] + e[4]
+        out.velocity[i, 0] = (cos * north + sin * east) / SPEED_SCALE_M_S
+        out.velocity[i, 1] = (cos * east - sin * north) / SPEED_SCALE_M_S
+        out.velocity[i, 2] = (fleet.velocity[i, 2] + e[5]) / SPEED_SCALE_M_S
+
+
+@kernel
+def heading_told(quaternion: Quat, turn: Vec) -> tuple[float, float]:
+    """Return cosine and sine of the heading that telemetry reports of an attitude, body -> NED.
+
+    `turn` is the attitude's error [rad], as of `estimation.perturbed`.
+    """
+    angle = math.sqrt(turn[0] * turn[0] + turn[1] * turn[1] + turn[2] * turn[2])
+    half = math.pi * (angle / (2.0 * math.pi))
+    share = 0.5 if angle == 0.0 else 0.5 * (math.sin(half) / half)
+    error = (math.cos(0.5 * angle), share * turn[0], share * turn[1], share * turn[2])
+    yaw = yaw_of(multiply(error, quaternion))
+    return math.cos(yaw), math.sin(yaw)

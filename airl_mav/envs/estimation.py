@@ -10,14 +10,16 @@ Every episode draws its random numbers from its own seed.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.core.kernels import kernel
+from airl_mav.core.constants import TICK_S, TICK_US, US_PER_S
+from airl_mav.core.kernels import borrowing_kernel, kernel
 from airl_mav.core.streams import Stream, stream
 from airl_mav.envs.draws import BLOCK
 from airl_mav.envs.saved_state import Stateful
@@ -62,18 +64,14 @@ class EstimationError:
             time_s[list(errors)] = getattr(table, time_name)
         return cls(sd, time_s)
 
+    def step(self, dt: float | Array) -> tuple[Array, Array]:
+        """Return how errors change in dt [s]: exact, so that steps may be of any length.
 
-def step_errors(model: EstimationError, errors: Array, normals: Array, dt: float | Array) -> Array:
-    """Return the errors after dt: exact for any dt, so that steps may be of any length.
-
-    Args:
-        model: Standard deviations and correlation times.
-        errors: (..., 9) before.
-        normals: (..., 9) standard normal numbers.
-        dt: Seconds, for all or (...) for each vehicle; 0 changes nothing.
-    """
-    kept = np.exp(-np.asarray(dt)[..., None] / model.time_s)
-    return kept * errors + model.sd * np.sqrt(1.0 - kept * kept) * normals
+        Returns:
+            (..., 9) the share that remains, and the standard deviation of what is added.
+        """
+        kept = np.exp(-np.asarray(dt)[..., None] / self.time_s)
+        return kept, self.sd * np.sqrt(1.0 - kept * kept)
 
 
 def perturbed(
@@ -114,51 +112,86 @@ def _turn(cos: Array, share: Array, turn: Array, quaternion: Array, out: Array) 
         out[i, 3] = w * c + s * z + (x * b - y * a)
 
 
+class Drift(NamedTuple):
+    """How errors change over a decision, as kernels take it."""
+
+    kept: Array
+    """(ticks, 9) share of an error that remains after so many ticks."""
+    added: Array
+    """(ticks, 9) standard deviation of what is added."""
+    normals: Array
+    """(n, BLOCK, 9) standard normal numbers of the present decisions."""
+    sd: Array
+    """(9,) `EstimationError`, as the next one."""
+    time_s: Array
+
+
+TABLE_S = 60.0
+"""Decisions up to this long have their row in `Drift` [s]."""
+
+
+@borrowing_kernel
+def step_error(drift: Drift, errors: Array, i: int, decision: int, ticks: int) -> None:
+    """Step the errors (n, 9) of vehicle i after its n-th decision, which took so long."""
+    row = decision % BLOCK
+    for k in range(N_ERRORS):
+        if ticks < len(drift.kept):
+            kept, added = drift.kept[ticks, k], drift.added[ticks, k]
+        else:
+            kept = math.exp(-(ticks * TICK_S) / drift.time_s[k])
+            added = drift.sd[k] * math.sqrt(1.0 - kept * kept)
+        errors[i, k] = kept * errors[i, k] + added * drift.normals[i, row, k]
+
+
 class Telemetry(Stateful):
     """Telemetry of n episodes: the truth with errors that change once a decision."""
 
     def __init__(self, n: int, table: Estimation | None, noise: float = 1.0) -> None:
         """Make n slots with the errors of a vehicle profile times `noise`; None: no errors."""
         self._model = None if table is None else EstimationError.from_profile(table, noise)
-        self._errors = np.zeros((n, N_ERRORS))
+        self.errors = np.zeros((n, N_ERRORS))
+        """(n, 9) present ones."""
         self._rngs: list[np.random.Generator | None] = [None] * n
         self._normals = np.zeros((n, BLOCK, N_ERRORS))
         """Standard normal numbers, `N_ERRORS` per decision, the first for the episode's start."""
+
+    def drift(self) -> Drift | None:
+        """Return how errors change over decisions; None: there are none.
+
+        The table is numpy's exponential, which differs from a compiled one by a bit.
+        """
+        if self._model is None:
+            return None
+        ticks = np.arange(round(TABLE_S / TICK_S))
+        changes = self._model.step(ticks * TICK_US / US_PER_S)
+        return Drift(*changes, self._normals, self._model.sd, self._model.time_s)
 
     def begin(self, i: int, seed: int) -> None:
         """Start the episode of slot i."""
         if self._model is not None:
             rng = stream(seed, Stream.ESTIMATION)
             self._rngs[i], self._normals[i] = rng, rng.standard_normal((BLOCK, N_ERRORS))
-            self._errors[i] = self._model.sd * self._normals[i, 0]
+            self.errors[i] = self._model.sd * self._normals[i, 0]
 
-    def step(self, decisions: NDArray[np.int64], flown_s: NDArray[np.float64]) -> None:
-        """Step the errors after each slot's n-th decision (n,), which took `flown_s` (n,) [s]."""
+    def draw(self, decisions: NDArray[np.int64]) -> None:
+        """Draw the numbers of slots whose n-th decision (n,) begins a block."""
         if self._model is None:
             return
         for i in np.flatnonzero(decisions % BLOCK == 0):
             rng = self._rngs[i]
             if rng is not None:
                 rng.standard_normal(out=self._normals[i])
-        # By whole rows: several times faster than by two indices.
-        rows = np.arange(len(decisions)) * BLOCK + decisions % BLOCK
-        normals = self._normals.reshape(-1, N_ERRORS).take(rows, axis=0)
-        self._errors = step_errors(self._model, self._errors, normals, flown_s)
 
     def report(self, truth: Kinematics, rows: Rows) -> Kinematics:
         """Return the states of `rows` as telemetry reports them; body rates have no error."""
         if self._model is None:
             return truth
-        errors = self._errors[rows]
+        errors = self.errors[rows]
         told = perturbed(truth.position, truth.velocity, truth.quaternion, errors)
         return Kinematics(*told, truth.rates)
 
-    def position(self, truth: Array) -> Array:
-        """Return the positions (n, 3) of all n as telemetry reports them; see `report`."""
-        return truth if self._model is None else truth + self._errors[:, POSITION]
-
     def _held(self) -> Mapping[str, Any]:
         return {
-            "now": {"errors": self._errors},
+            "now": {"errors": self.errors},
             "normals": {"block": self._normals, "generators": self._rngs},
         }

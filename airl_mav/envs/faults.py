@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.frames import Vector
+from airl_mav.core.kernels import kernel
 from airl_mav.faults.kinds import Part
 from airl_mav.faults.model import Fault
 from airl_mav.faults.schedule import FOREVER_US, gust_share, window_us
@@ -78,6 +79,22 @@ def later_us(faults: Sequence[TwinFault], time_us: NDArray[np.int64]) -> NDArray
     more = np.zeros_like(time_us)
     for each in faults:
         more += np.where(each.at(time_us), round(each.fault.amount * US_PER_S), 0)
+    return more
+
+
+def delays_of(faults: Sequence[TwinFault]) -> NDArray[np.int64]:
+    """Return faults `delay` for kernels: (k, 3) begin, end, and by how much, all [µs]."""
+    rows = [(each.from_us, each.to_us, round(each.fault.amount * US_PER_S)) for each in faults]
+    return np.array(rows, np.int64).reshape(-1, 3)
+
+
+@kernel
+def later_in(delays: NDArray[np.int64], time_us: int) -> int:
+    """Return by how much what is sent at a time [µs] comes later; `delays` as of `delays_of`."""
+    more = 0
+    for k in range(len(delays)):
+        if delays[k, 0] <= time_us < delays[k, 1]:
+            more += delays[k, 2]
     return more
 
 

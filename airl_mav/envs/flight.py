@@ -43,11 +43,10 @@ from airl_mav.control.memory import (
 )
 from airl_mav.control.mixer import allocate, desaturate
 from airl_mav.core.constants import TICK_S, TICK_US
-from airl_mav.core.kernels import kernel
-from airl_mav.envs.arenas import ArenaBatch, move_obstacles, relief_of
-from airl_mav.envs.contact import NOTHING, clearance, touches
-from airl_mav.envs.fleet import Fleet, Rules, Vehicle, Verdict
-from airl_mav.envs.lanes import (
+from airl_mav.core.kernels import borrowing_kernel, kernel, large_kernel
+from airl_mav.envs.arenas import NOTHING, ArenaBatch, clearance, move_obstacles, relief_of, touches
+from airl_mav.envs.decision import Decision, next_stretch
+from airl_mav.envs.fleet import (
     AIRFRAME,
     AIRFRAME_SIZE,
     ATTITUDE,
@@ -78,13 +77,17 @@ from airl_mav.envs.lanes import (
     WANTED,
     WIND,
     YAW_RATE,
+    Fleet,
+    Lanes,
+    Rules,
     State,
+    Vehicle,
+    Verdict,
     load,
     quat,
     unload,
     vec,
 )
-from airl_mav.envs.legs import Legs, next_leg
 from airl_mav.vehicle.airframe import airframe_of
 from airl_mav.vehicle.battery import drain, open_circuit, terminal_voltage
 from airl_mav.vehicle.power import felt, felt_share, flight_power_w
@@ -118,7 +121,6 @@ def advance(
     vehicle: Vehicle,
     rules: Rules,
     air: NDArray[np.float64] | None,
-    legs: Legs | None = None,
 ) -> None:
     """Fly every vehicle whose verdict is FLYING for its number of ticks on its setpoint.
 
@@ -135,27 +137,46 @@ def advance(
         vehicle: What all vehicles share.
         rules: What ends a flight.
         air: (n, k, 3) wind NED [m/s]; of the k rows each tick since the start of a flight takes the
-            next, after the last one the first again. None: calm.
-        legs: What happens on the way, with a first leg of one tick at least; `ticks` are the sums
-            of its legs. That of vehicles that do not fly stays as it is. None: nothing happens.
+            next, after the last one the first again. None, or k = 0: calm.
+    """
+    fly(fleet, arenas, ticks.copy(), vehicle, rules, air, None, LANES)
+    for i in range(len(ticks)):
+        if ticks[i] > 0:
+            move_obstacles(arenas, i, fleet.time_us[i])
+
+
+@large_kernel
+def fly(
+    fleet: Fleet,
+    arenas: ArenaBatch,
+    todo: NDArray[np.int64],
+    vehicle: Vehicle,
+    rules: Rules,
+    air: NDArray[np.float64] | None,
+    decision: Decision | None,
+    lanes: Lanes,
+) -> None:
+    """Fly vehicles as `advance` does, as many at a time as there are `lanes`.
+
+    With a `decision`, decisions are flown to their end or to where Python is needed, of vehicles
+    whose `todo` is not 0. It becomes 0. Moving obstacles are moved where they matter.
     """
     weights, kept = filters(vehicle.gains, TICK_S), felt_share(vehicle.power, TICK_S)
     # Made here with sizes that are constants: so the compiler knows that no two rows overlap.
-    state, spare = np.zeros((ROWS, LANES)), np.zeros((MEMORY_SIZE, LANES))
-    who, left = np.full(LANES, _NOBODY), np.zeros(LANES, np.int64)
-    leg = np.zeros(LANES, np.int64)
+    state, spare = np.zeros((ROWS, len(lanes))), np.zeros((MEMORY_SIZE, len(lanes)))
+    who, left = np.full(len(lanes), _NOBODY), np.zeros(len(lanes), np.int64)
     # Those whose position loops are due at the same ticks fly together: one loop runs for all.
-    todo, coming, odd, aloft = ticks.copy(), np.zeros(2, np.int64), 0, 0
+    coming, odd = np.zeros(2, np.int64), 0
     while True:
-        aloft += _fill(fleet, legs, todo, coming, odd, who, left, leg, state)
+        aloft = _fill(fleet, decision, todo, coming, odd, who, left, state)
         if aloft == 0:
             return
-        for j in range(LANES):
+        for j in range(len(lanes)):
             i = who[j]
             if i != _NOBODY:
                 if fleet.time_us[i] >= fleet.repeat_us[i]:
                     _repeat(fleet, i, state, j)
-                if air is not None:
+                if air is not None and air.shape[1] > 0:
                     _blow(air[i], fleet.time_us[i], state, j)
         by_rates = _outer_loops(state, spare, who, aloft, vehicle.gains, weights)
         if by_rates:
@@ -165,7 +186,7 @@ def advance(
             _keep_rates(state, who)
         odd ^= 1
         _move(state, vehicle, kept)
-        for j in range(LANES):
+        for j in range(len(lanes)):
             i = who[j]
             if i != _NOBODY:
                 here, hit = vec(state, POSITION, j), NOTHING
@@ -179,53 +200,57 @@ def advance(
                 fleet.verdict[i] = _verdict(
                     here, goal, hit, state[BATTERY, j], fleet.time_us[i], rules
                 )
-                left[j] -= 1
-                if left[j] == 0 or fleet.verdict[i] != _FLYING:
-                    if legs is not None:
-                        over = fleet.verdict[i] != _FLYING
-                        leg[j], left[j] = next_leg(legs, fleet, i, state, j, leg[j], over)
-                        if left[j] != 0:
-                            continue
-                    move_obstacles(arenas, i, fleet.time_us[i])
-                    unload(fleet, i, state, j)
-                    who[j] = _NOBODY
-                    aloft -= 1
+                left[j] = left[j] - 1 if fleet.verdict[i] == _FLYING else 0
 
 
-@kernel
+@borrowing_kernel
 def _fill(
     fleet: Fleet,
-    legs: Legs | None,
+    decision: Decision | None,
     todo: NDArray[np.int64],
     coming: NDArray[np.int64],
     odd: int,
     who: NDArray[np.int64],
     left: NDArray[np.int64],
-    leg: NDArray[np.int64],
     state: State,
 ) -> int:
-    """Put the next vehicles into the empty lanes; return how many.
+    """Let vehicles go on whose ticks are flown, or put others into their lanes; return how many.
 
-    Arguments as of `_next` and `advance`, and of all lanes (LANES,): who is in each, how many ticks
-    are left, and of which leg.
+    Arguments as of `_next` and `fly`, and of all lanes: who is in each, how many ticks are left.
     """
-    found = 0
-    for j in range(LANES):
-        for other in range(2):
-            if who[j] == _NOBODY:
-                who[j] = _next(todo, fleet.verdict, fleet.memory, odd ^ other, coming)
-                if who[j] != _NOBODY:
-                    left[j], todo[who[j]] = todo[who[j]], 0
-                    if legs is not None:
-                        leg[j], left[j] = 0, legs.ticks[who[j], 0]
-                    load(fleet, who[j], state, j)
-                    found += 1
-    return found
+    aloft = 0
+    for j in range(len(who)):
+        while who[j] == _NOBODY or left[j] == 0:
+            if who[j] != _NOBODY:
+                left[j] = _stretch(decision, fleet, who[j], state, j)
+                if left[j] == 0:
+                    unload(fleet, who[j], state, j)
+                    who[j] = _NOBODY
+                continue
+            every = decision is not None
+            i = _next(todo, every, fleet.verdict, fleet.memory, odd, coming)
+            if i == _NOBODY:
+                i = _next(todo, every, fleet.verdict, fleet.memory, odd ^ 1, coming)
+            if i == _NOBODY:
+                break
+            load(fleet, i, state, j)
+            who[j], left[j], todo[i] = i, 0 if every else todo[i], 0
+        aloft += who[j] != _NOBODY
+    return aloft
 
 
-@kernel
+@borrowing_kernel
+def _stretch(decision: Decision | None, fleet: Fleet, i: int, state: State, j: int) -> int:
+    """Return how many ticks vehicle i, in lane j, flies next; 0: none."""
+    if decision is None:
+        return 0
+    return next_stretch(decision, fleet, i, state, j)
+
+
+@borrowing_kernel
 def _next(
     todo: NDArray[np.int64],
+    every: bool,
     verdict: NDArray[np.int64],
     memory: NDArray[np.float64],
     odd: int,
@@ -233,22 +258,19 @@ def _next(
 ) -> int:
     """Return the next vehicle that has to fly and whose position loop is due now, or nobody.
 
-    Args:
-        todo: (n,) how many ticks each one has to fly.
-        verdict: (n,) of the fleet.
-        memory: (n, MEMORY_SIZE) of the fleet.
-        odd: 1: the next whose loop is due a tick later.
-        coming: (2,) where the search goes on, for both; updated.
+    Where `odd` is 1, it is due a tick later. `coming` (2,) is where the search resumes for both. Of
+    decisions, `every` one is carried out, also where the flight is over.
     """
     while coming[odd] < len(todo):
         i: int = coming[odd]
         coming[odd] += 1
-        if todo[i] > 0 and verdict[i] == _FLYING and (memory[i, WAIT] != 0.0) == (odd == 1):
+        flies = todo[i] > 0 and (every or verdict[i] == _FLYING)
+        if flies and (memory[i, WAIT] != 0.0) == (odd == 1):
             return i
     return _NOBODY
 
 
-@kernel
+@borrowing_kernel
 def _repeat(fleet: Fleet, i: int, state: State, j: int) -> None:
     """Turn the setpoint of vehicle i, in lane j, into NED by the present heading.
 
@@ -269,7 +291,7 @@ def _repeat(fleet: Fleet, i: int, state: State, j: int) -> None:
         state[WANTED + axis, j] = fleet.velocity_ned[i, axis]
 
 
-@kernel
+@borrowing_kernel
 def _blow(air: NDArray[np.float64], time_us: int, state: State, j: int) -> None:
     """Put the wind of a tick, of the rows `air` (k, 3) of a vehicle, into its lane j."""
     row = time_us // TICK_US % len(air)
@@ -288,19 +310,12 @@ def _outer_loops(
 ) -> bool:
     """Run the first half of `cascade_tick` in every lane: to what the attitude loop flies.
 
-    Args:
-        state: Updated.
-        spare: (MEMORY_SIZE, LANES) room to work in.
-        who: (LANES,) which vehicle is in each lane, or nobody.
-        aloft: In how many lanes somebody is.
-        gains: Gains and limits.
-        weights: `filters(gains, TICK_S)`.
-
-    Returns:
-        Whether body rates are commanded in any lane; there nothing is run but a filter.
+    `spare` (MEMORY_SIZE, lanes) is room to work in, `who` (lanes,) the vehicle in each lane or
+    nobody, `aloft` the number of vehicles, `weights` is `filters(gains, TICK_S)`. Return whether
+    body rates are commanded in any lane; there nothing is run but a filter.
     """
     due, by_rates = 0, 0
-    for j in range(LANES):
+    for j in range(state.shape[1]):
         memory = state[MEMORY:ROWS, j]
         by_rates += who[j] != _NOBODY and state[BY_RATES, j] != 0.0
         first = start(vec(state, VELOCITY, j), vec(state, RATES, j), memory, weights)
@@ -311,17 +326,19 @@ def _outer_loops(
         # In all lanes, or none would be fast; those that are not due keep what they had.
         kept = due < aloft or by_rates > 0
         if kept:
-            spare[:] = state[MEMORY:ROWS]
-        for j in range(LANES):
+            for row in range(MEMORY_SIZE):
+                for j in range(state.shape[1]):
+                    spare[row, j] = state[MEMORY + row, j]
+        for j in range(state.shape[1]):
             demand = Demand(NAN3, vec(state, WANTED, j), math.nan, state[YAW_RATE, j])
             p, v, q = vec(state, POSITION, j), vec(state, VELOCITY, j), quat(state, ATTITUDE, j)
             position_loop(p, v, q, demand, state[MEMORY:ROWS, j], gains, weights, TICK_S)
-        for j in range(LANES):
+        for j in range(state.shape[1]):
             if state[MEMORY + WAIT, j] != 0.0:
                 if kept:
-                    state[MEMORY:ROWS, j] = spare[:, j]
+                    _restore(state, spare, j)
             elif state[BY_RATES, j] != 0.0:
-                state[MEMORY:ROWS, j] = spare[:, j]
+                _restore(state, spare, j)
                 velocity, period = vec(state, VELOCITY, j), POSITION_TICKS * TICK_S
                 differentiate(velocity, state[MEMORY:ROWS, j], weights, period)
                 state[MEMORY + WAIT, j] = POSITION_TICKS
@@ -333,20 +350,27 @@ def _outer_loops(
 
 
 @kernel
+def _restore(state: State, spare: NDArray[np.float64], j: int) -> None:
+    """Write the memory of lane j back."""
+    for row in range(MEMORY_SIZE):
+        state[MEMORY + row, j] = spare[row, j]
+
+
+@kernel
 def _inner_loops(state: State, who: NDArray[np.int64], gains: Gains, weights: Filters) -> None:
     """Run the second half of `cascade_tick` in every lane: to the motor commands.
 
     Arguments as of `_outer_loops`.
     """
-    for j in range(LANES):
+    for j in range(state.shape[1]):
         q, q_sp = quat(state, ATTITUDE, j), quat(state, PUBLISHED, j)
         reduced, state[HALF_TURN, j] = reduced_attitude(q, q_sp)
         for k in range(4):
             state[REDUCED + k, j] = reduced[k]
         state[MEMORY + WAIT, j] -= 1.0
-    for j in range(LANES):
+    for j in range(state.shape[1]):
         state[HALF_TURN, j] = weighted_turn(state[HALF_TURN, j], gains)
-    for j in range(LANES):
+    for j in range(state.shape[1]):
         memory, reduced = state[MEMORY:ROWS, j], quat(state, REDUCED, j)
         yaw_rate = state[PUBLISHED_YAW_RATE, j]
         wanted = rates_towards(
@@ -363,7 +387,7 @@ def _inner_loops(state: State, who: NDArray[np.int64], gains: Gains, weights: Fi
             memory[SAT + axis] = 0.0
         for k in range(4):
             state[MOTORS + k, j] = motors[k]
-    for j in range(LANES):
+    for j in range(state.shape[1]):
         if state[FITS, j] == 0.0 and who[j] != _NOBODY:
             motors, missing = desaturate(state[COLLECTIVE, j], vec(state, TORQUE, j), gains)
             for axis in range(3):
@@ -378,7 +402,7 @@ def _prepare_rates(state: State, who: NDArray[np.int64]) -> None:
 
     It flies what the attitude loop has published before: here that is the command.
     """
-    for j in range(LANES):
+    for j in range(state.shape[1]):
         if who[j] != _NOBODY and state[BY_RATES, j] != 0.0:
             for axis in range(3):
                 state[MEMORY + RATES_SP + axis, j] = state[WANTED + axis, j]
@@ -389,7 +413,7 @@ def _prepare_rates(state: State, who: NDArray[np.int64]) -> None:
 @kernel
 def _keep_rates(state: State, who: NDArray[np.int64]) -> None:
     """Leave the memory as `rate_tick` does, where body rates are commanded."""
-    for j in range(LANES):
+    for j in range(state.shape[1]):
         if who[j] != _NOBODY and state[BY_RATES, j] != 0.0:
             for axis in range(3):
                 state[MEMORY + RATES_SP + axis, j] = state[WANTED + axis, j]
@@ -411,15 +435,9 @@ def _publish(state: State, j: int) -> None:
 
 @kernel
 def _move(state: State, vehicle: Vehicle, kept: float) -> None:
-    """Move the body in every lane by a tick, on its motor commands.
-
-    Args:
-        state: Updated.
-        vehicle: What all vehicles share.
-        kept: `felt_share` of a tick.
-    """
+    """Move the body in every lane by a tick; `kept` is `felt_share` of a tick."""
     pack = vehicle.pack
-    for j in range(LANES):
+    for j in range(state.shape[1]):
         p, v = vec(state, POSITION, j), vec(state, VELOCITY, j)
         q, w = quat(state, ATTITUDE, j), vec(state, RATES, j)
         airframe = airframe_of(state[AIRFRAME : AIRFRAME + AIRFRAME_SIZE, j])

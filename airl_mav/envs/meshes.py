@@ -6,7 +6,6 @@ behind the trees of files there is room for that of every arena.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -31,8 +30,10 @@ class MeshBatch(NamedTuple):
 
 
 @kernel
-def meshes_in(batch: MeshBatch, i: int, obstacles: int, relief: Relief) -> Meshes:
-    """Return the meshes of arena i, which has so many obstacles, and such ground."""
+def meshes_in(batch: MeshBatch | None, i: int, obstacles: int, relief: Relief) -> Meshes | None:
+    """Return the meshes of arena i, which has so many obstacles, and such ground; None: none."""
+    if batch is None:
+        return None
     k = batch.present[i]
     return Meshes(
         batch.bvh,
@@ -107,12 +108,6 @@ class MeshesSeen:
             each = self._arenas[k]
             if each is not None and each.clear is not None:
                 depth.owner[k, : len(each.obstacles)][each.clear] = UNSEEN
-
-    def restore(self, arenas: Sequence[Arena | None]) -> None:
-        """Take the meshes of all slots again; None: no episode has begun there."""
-        for i, arena in enumerate(arenas):
-            if arena is not None:
-                self.put(i, arena)
 
     def _fits(self, batch: MeshBatch, arena: Arena) -> bool:
         """Return whether an arena has room in a batch."""

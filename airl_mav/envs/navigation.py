@@ -8,9 +8,7 @@ as well. Everything is in ticks of simulated time, so nothing depends on the mac
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,21 +16,25 @@ from numpy.typing import NDArray
 
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.constants import TICK_US, US_PER_MS, US_PER_S, CommandKind
-from airl_mav.core.errors import FieldError
+from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.streams import Stream, stream
 from airl_mav.envs.arenas import ArenaBatch, move_all_obstacles
 from airl_mav.envs.cameras import Cameras
 from airl_mav.envs.companions import Companions
-from airl_mav.envs.delay import injections_of
-from airl_mav.envs.draws import DelayDraws
-from airl_mav.envs.encoding import COMPILED
+from airl_mav.envs.decision import Timing, begin_decision, new_decision
+from airl_mav.envs.draws import BLOCK, DelayDraws, Winds
+from airl_mav.envs.encoding import COMPILED, EncodedBody
 from airl_mav.envs.episode_arenas import EpisodeArenas
 from airl_mav.envs.estimation import Telemetry
-from airl_mav.envs.faults import later_us, twin_faults
+from airl_mav.envs.faults import delays_of, later_us, twin_faults
 from airl_mav.envs.fleet import (
+    ALONE,
+    LANES,
     STILL,
     Fleet,
+    Flights,
     Rules,
+    Seen,
     Vehicle,
     Verdict,
     hover,
@@ -40,20 +42,19 @@ from airl_mav.envs.fleet import (
     put_vehicle,
     vehicle_of,
 )
-from airl_mav.envs.flight import advance
-from airl_mav.envs.legs import Legs
-from airl_mav.envs.rate_setpoints import RateSetpoints
+from airl_mav.envs.flight import fly
 from airl_mav.envs.saved_state import State, Stateful
 from airl_mav.envs.sight import check_conditions, sight_of
-from airl_mav.envs.spec import EnvironmentSpec
-from airl_mav.envs.timing import PipelinedTiming, SequentialTiming, give, ticks_of
+from airl_mav.envs.spec import SHIPPED_REWARDS, EnvironmentSpec
+from airl_mav.envs.stopping import injections_of
 from airl_mav.envs.trace import Trace
-from airl_mav.envs.winds import Winds
+from airl_mav.envs.world import World, decide, status
 from airl_mav.faults.model import Fault
 from airl_mav.faults.twin import check_twin
 from airl_mav.latency.injection import Injection
-from airl_mav.policy.actions import UPRIGHT_S, vertical_speeds
-from airl_mav.policy.layouts import encode_layout
+from airl_mav.policy.actions import UPRIGHT_S
+from airl_mav.policy.images import Bytes, body_bytes
+from airl_mav.policy.layouts import GOAL, VELOCITY, encode_layout
 from airl_mav.policy.observation import Kinematics, Observation, Rows, observe
 from airl_mav.policy.observation_spec import Encoded, ObservationSpec
 from airl_mav.prediction.compensator import Compensator
@@ -68,33 +69,6 @@ from airl_mav.vehicle.spread import draw_airframe, spreads
 
 EVERYONE = slice(None)
 """The rows of all n vehicles."""
-
-
-@dataclass(frozen=True)
-class Flights:
-    """Status of n flights; arrays (n,)."""
-
-    verdict: NDArray[np.int64]
-    """`fleet.Verdict`."""
-    time_s: NDArray[np.float64]
-    distance_m: NDArray[np.float64]
-    """Flown so far [m]."""
-    energy_j: NDArray[np.float64]
-    goal_distance_m: NDArray[np.float64]
-    """True; seen from above, where the goal has no height."""
-    speed_m_s: NDArray[np.float64]
-    """Three-dimensional, true."""
-    battery: NDArray[np.float64]
-    """Charge left, 1 to 0."""
-    touched: NDArray[np.int64]
-    """Index of the obstacle that is touched, or `contact.FLOOR`, `CEILING`, `WALL`, `NOTHING`."""
-
-    def with_rows(self, rows: Rows, others: Flights) -> Flights:
-        """Return these with `others` in their rows."""
-        replaced = {name: array.copy() for name, array in vars(self).items()}
-        for name, array in replaced.items():
-            array[rows] = getattr(others, name)
-        return Flights(**replaced)
 
 
 class WholeTruth(NamedTuple):
@@ -165,11 +139,8 @@ class Navigation(Stateful):
         self.intrinsics: Intrinsics = sight.intrinsics
         known = self.arena_spec.generator == OBSTACLES
         if spec.goal_height and known and self.arena_spec.goal.height_m is None:
-            raise FieldError(
-                "goal_height",
-                True,
-                f"false in arena {spec.arena!r}, whose profile has no goal.height_m",
-            )
+            accepted = f"false in arena {spec.arena!r}, whose profile has no goal.height_m"
+            raise FieldError("goal_height", True, accepted)
         self.injections = injections_of(spec.delay) if injection is None else (injection,)
         self._trace = trace
         parameters = flown_values(self.vehicle.autopilot_parameters())
@@ -177,24 +148,18 @@ class Navigation(Stateful):
         self._charge = battery_charge
         rules = spec.episode
         self._rules = Rules(rules.goal_radius_m, round(rules.time_limit_s * US_PER_S))
-        self._hold_us = round(rules.hold_s * US_PER_S)
         self._transport_us = round(spec.delay.transport_ms * US_PER_MS)
         self._link_us = round(spec.delay.link_ms * US_PER_MS)
-        hover_s = rules.hover_after_s
-        self._hover_us = None if hover_s is None else round(hover_s * US_PER_S)
-        self._places = EpisodeArenas(
-            spec,
-            self.arena_spec,
-            n,
-            self.vehicle.body.width_m,
-            arena_seed,
-            looks=sight.coloured,
-        )
+        width_m, looks = self.vehicle.body.width_m, sight.coloured
+        self._places = EpisodeArenas(spec, self.arena_spec, n, width_m, arena_seed, looks=looks)
         self.stages, self.arenas = self._places.stages, self._places.present
         self.seeds, self.zones = self._places.seeds, self._places.zones
         self.fleet, self._calm_start = new_fleet(n), new_fleet(1)
         hover(self._calm_start, 0, rules.altitude_m, self._vehicle, battery=battery_charge)
-        self._decision = np.zeros(n, np.int64)
+        self._number = np.zeros(n, np.int64)
+        """(n,) of the present decisions in their episodes, from 0 on."""
+        self._before_draw = 0
+        """Decisions that are flown before any of their draws are due."""
         self._extra_us = np.zeros(n, np.int64)
         self._delays = DelayDraws(
             n, self.injections, round(spec.delay.native_ms * US_PER_MS), draw=latency_draw
@@ -207,29 +172,23 @@ class Navigation(Stateful):
         pipelined = spec.decisions == "pipelined"
         check_twin(faults, pipelined=pipelined)
         self._winds = Winds(n, spec.wind, faults)
-        self.cameras = Cameras(
-            n,
-            self.camera,
-            self._transport_us,
-            randomisation,
-            faults,
-            self._places.looks,
-            self._places.meshes,
-            sight.further,
-        )
+        seen = (self._places.looks, self._places.meshes, sight.further)
+        self.cameras = Cameras(n, self.camera, self._transport_us, randomisation, faults, *seen)
         self._uplink = twin_faults(faults, "uplink")
-        self._timing: SequentialTiming | PipelinedTiming
-        rates = None
-        if self.by_rates:
-            held_s = 0.0 if pipelined else rules.hold_s
-            timeout_s = rules.decision_timeout_s or held_s + UPRIGHT_S
-            rates = RateSetpoints(n, round(timeout_s * US_PER_S))
-        if pipelined:
-            self._timing = PipelinedTiming(n, self._link_us, rates)
-        else:
-            self._timing = SequentialTiming(
-                self.cameras, self._link_us, self._hold_us, self._hover_us, self._uplink, rates
-            )
+        self._decision = new_decision(self._times(pipelined=pipelined), self._telemetry.errors)
+        self._stops = trace is not None or self._winds.gusty or self.cameras.may_freeze
+        """Whether Python may be needed while a decision is flown."""
+        self._lanes = ALONE if n == 1 else LANES
+        own = spec.reward not in SHIPPED_REWARDS
+        self._reward = -1 if own else SHIPPED_REWARDS.index(spec.reward)
+        self._world: World | None = None
+        self._status: Flights | None = None
+        self.paid = np.zeros(n)
+        """(n,) rewards of the last decisions, by the formula of `spec`, if it is a shipped one."""
+        self.ending = np.zeros(n, np.int64)
+        """(n,) how the last decisions have ended flights: `world.GOES_ON` and the others."""
+        self._encoded: Encoded | None = None
+        """What networks see now, if it is known and nobody has it."""
         if compensator is None and spec.compensate:
             compensator = Compensator(n, self.vehicle, self.intrinsics)
         self._companions = Companions(
@@ -242,6 +201,47 @@ class Navigation(Stateful):
                 name: (lens, spec.cameras[name].frames - 1) for name, lens in sight.lenses.items()
             },
         )
+        self._drift = self._telemetry.drift()
+        self._renders = self.cameras.eye is not None
+        """Whether kernels take the frames; else Python does."""
+        self._encoding = self._encoding_of(spec) if self._renders else None
+
+    def _times(self, *, pipelined: bool) -> Timing:
+        """Return the times of decisions.
+
+        Raises:
+            UsageError: The hold is so short that a decision would have to wait for its frame.
+        """
+        rules, cameras = self.spec.episode, self.cameras
+        hold_us = round(rules.hold_s * US_PER_S)
+        late_us = round(sum(each.fault.amount for each in self._uplink) * US_PER_S)
+        least_us = self._link_us + late_us + cameras.latest_us + cameras.times.period_us
+        if not pipelined and hold_us < least_us:
+            raise UsageError(
+                f"episode.hold_s = {rules.hold_s:g}: accepted: value >= {least_us / 1e6:g} s "
+                f"(delay.link_ms, delay.transport_ms and {cameras.times.period_us / 1e3:g} ms"
+                " between two frames, and what faults delay)"
+            )
+        timeout_us = -TICK_US
+        if self.by_rates:
+            held_s = 0.0 if pipelined else rules.hold_s
+            timeout_us = round((rules.decision_timeout_s or held_s + UPRIGHT_S) * US_PER_S)
+        return Timing(
+            pipelined=pipelined,
+            link_us=self._link_us,
+            hold_us=hold_us,
+            hover_us=-1 if rules.hover_after_s is None else round(rules.hover_after_s * US_PER_S),
+            timeout=round(timeout_us / TICK_US),
+            altitude_m=rules.altitude_m,
+            uplink=delays_of(self._uplink),
+            frames=cameras.times,
+        )
+
+    def _encoding_of(self, spec: EnvironmentSpec) -> Bytes | None:
+        """Return how kernels encode what networks see; None: Python does."""
+        if spec.layout != "body" or spec.frames > 1 or spec.in_flight or spec.goal_height:
+            return None
+        return None if self._companions.foresee else body_bytes(self.camera.range_m)
 
     def begin(self, slots: Sequence[int], seeds: Sequence[int], zone: int | None = None) -> None:
         """Start episodes: each in a hover above its start, the first frame taken.
@@ -259,7 +259,11 @@ class Navigation(Stateful):
         for i, seed in zip(slots, seeds, strict=True):
             self._begin(i, int(seed), zone)
             who[i] = True
-        self.capture(who)
+        self._before_draw, self._world, self._status = 0, None, None
+        self._encoded = None
+        for array, theirs in zip(self._decision.seen, self._moving(), strict=True):
+            array[who] = theirs[who]
+        self._take_frames(who)
         self._look_ahead(who)
 
     def prepare(self, seeds: Sequence[int], zone: int | None = None) -> None:
@@ -286,14 +290,14 @@ class Navigation(Stateful):
             hover(self.fleet, i, altitude_m, self._vehicle, airframe, self._charge, wind)
         if self._trace is not None:
             self._trace.begin(i, self.fleet)
-        self._decision[i] = 0
+        self._number[i] = 0
         low, high = randomisation.extra_delay_ms
         extra_ms = low if low == high else stream(seed, Stream.DELAY).uniform(low, high)
         self._extra_us[i] = round(extra_ms * US_PER_MS)
         self._delays.begin(i, seed)
         self._telemetry.begin(i, seed)
         self.cameras.begin(i, seed)
-        self._timing.begin(i)
+        begin_decision(self._decision, i)
         self._companions.begin(i)
 
     def see(self, slots: Sequence[int] | None = None) -> Observation:
@@ -325,27 +329,22 @@ class Navigation(Stateful):
 
         Of all vehicles, or of those in `slots`.
         """
+        encoded, self._encoded = self._encoded, None
+        if encoded is not None and slots is None:
+            return encoded
         return encode_layout(self.observation, self.see(slots), COMPILED)
 
     def kinematics(self, rows: Rows = EVERYONE) -> Kinematics:
         """Return the state of all n as telemetry reports it: with the estimator's error."""
         return self._telemetry.report(self.truth(rows), rows)
 
-    def flights(self, rows: Rows = EVERYONE) -> Flights:
-        """Return the status of all flights, or of those in `rows`; copies."""
-        fleet = self.fleet
-        to_goal = self._places.batch.goal[rows] - fleet.position[rows]
-        away, below = np.hypot(to_goal[:, 0], to_goal[:, 1]), to_goal[:, 2]
-        return Flights(
-            verdict=np.array(fleet.verdict[rows]),
-            time_s=fleet.time_us[rows] / US_PER_S,
-            distance_m=np.array(fleet.distance[rows]),
-            energy_j=np.array(fleet.energy[rows]),
-            goal_distance_m=np.where(np.isnan(below), away, np.hypot(away, below)),
-            speed_m_s=np.linalg.norm(fleet.velocity[rows], axis=1),
-            battery=np.array(fleet.battery[rows]),
-            touched=np.array(fleet.touched[rows]),
-        )
+    def flights(self) -> Flights:
+        """Return the status of all flights; nothing changes it."""
+        if self._status is None:
+            numbers, whole = self._room_for_status()
+            status(self.fleet, self._places.batch.goal, numbers, whole)
+            self._status = Flights(*whole[:2], *numbers[:-1])
+        return self._status
 
     def truth(self, rows: Rows = EVERYONE) -> Kinematics:
         """Return the true state of all n; a copy."""
@@ -355,15 +354,18 @@ class Navigation(Stateful):
 
     def whole_truth(self) -> WholeTruth:
         """Return all that the twin knows, the very arrays that it flies on: to look at only."""
+        if self._places.begun.any():  # Until then there is no arena.
+            move_all_obstacles(self._places.batch, self.fleet.time_us)
         return WholeTruth(self.fleet, self._places.batch, self._vehicle)
 
-    def fly(self, commands: NDArray[np.float64]) -> None:
+    def fly(self, commands: NDArray[np.float64], *, encode: bool = False) -> None:
         """Fly one decision of every flight that has not ended.
 
         Args:
             commands: (n, 3) forward, right [m/s], yaw rate [rad/s]: an altitude is held; or
                 (n, 4): behind them the downward speed [m/s], NaN where the altitude is held. Or,
                 `by_rates`, (n, 4) body rates FRD [rad/s] and thrust 0..1.
+            encode: `observe` comes next.
 
         Raises:
             ValueError: Not n commands.
@@ -372,33 +374,110 @@ class Navigation(Stateful):
         if commands.ndim != 2 or len(commands) != self.n or not least <= commands.shape[1] <= 4:
             accepted = " or ".join(f"({self.n}, {width})" for width in range(least, 5))
             raise ValueError(f"commands of shape {commands.shape}: accepted: {accepted}")
-        # NaN: decided when it is sent.
-        down = commands[:, 3] if commands.shape[1] == 4 else math.nan
-        setpoints = np.insert(commands[:, :3], 2, down, axis=1)
-        if self.by_rates:
-            setpoints = np.array(commands)
         if self._trace is not None:
-            self._trace.deciding(self.fleet)
-        began_us = self.fleet.time_us.copy()
-        t2_us = self._delays.take(self._decision) + self._extra_us
+            self._trace.deciding(self.fleet, self._decision.seen.time_us)
         if self._companions.remember:
             images = self._further_images()
             self._companions.deciding(self.cameras.image, self.kinematics(), images)
-        self._companions.aged(self._timing.fly(self, setpoints, t2_us))
-        self._decision += 1
-        self._telemetry.step(self._decision, (self.fleet.time_us - began_us) / US_PER_S)
+        self._draw()
+        world = self._world or self._made_world()
+        image = self.observation.image_shape if encode and self._encoding else (0, 0)
+        rows = self.n if image[0] else 0
+        seen = EncodedBody(
+            np.empty((rows, *image), np.uint8),
+            np.empty((rows, 3), np.float32),
+            np.empty((rows, 3), np.float32),
+        )
+        self._fly(world, commands, seen)
+        if rows:
+            self._encoded = {"depth": seen.depth[:, None], VELOCITY: seen.velocity, GOAL: seen.goal}
+        self._tell()
+
+    def _fly(self, world: World, commands: NDArray[np.float64], seen: EncodedBody) -> None:
+        """Fly a decision, with stops where Python is needed."""
+        numbers, whole = self._room_for_status()
+        waiting, resumed = self.n, False
+        while waiting > 0:
+            if self._stops:
+                self._winds.blow(self.fleet)
+                self._decision.pause_us[:] = self._next_stop_us()
+            waiting = decide(world, commands, resumed, numbers, whole, seen)
+            if self._stops:
+                self.cameras.freeze(self.fleet, self._places.batch, self.seeds)
+                if self._trace is not None:
+                    self._trace.sample(self.fleet)
+            resumed = True
+        self._status = Flights(*whole[:2], *numbers[:-1])
+        self.paid, self.ending = numbers[-1], whole[2]
+        if not self._renders:
+            self._take_frames(np.ones(self.n, np.bool_))
+
+    def _next_stop_us(self) -> NDArray[np.int64]:
+        """Return when Python is needed (n,) [µs]."""
+        limits = [self._winds.ends_us(), self.cameras.next_freeze_us(self.fleet.time_us)]
+        if self._trace is not None:
+            limits.append(self._trace.next_us(self.fleet))
+        soonest: NDArray[np.int64] = np.minimum.reduce(
+            [each for each in limits if each is not None]
+        )
+        return soonest
+
+    def _tell(self) -> None:
+        """Note the decisions that were flown where anybody keeps account of them."""
+        decision = self._decision
+        began_us, t2_us = decision.began_us, decision.t2_us
         if self._trace is not None:
             self._trace.decided(
                 self.fleet,
-                setpoints,
+                decision.setpoint,
                 t2_us,
                 self._transport_us + self.cameras.delay_us(self._trace.seen_us),
                 self._link_us + later_us(self._uplink, began_us + t2_us),
             )
-        sent_us = began_us + TICK_US * ticks_of(t2_us)
-        stop_us = None if self._hover_us is None else sent_us + self._hold_us + self._hover_us
-        self._companions.decided(setpoints, t2_us, sent_us, stop_us)
-        self._look_ahead(self.fleet.verdict == Verdict.FLYING)
+        if self._companions.account:
+            self._companions.aged(TICK_US * decision.age)
+            sent_us = began_us + TICK_US * ((t2_us + TICK_US // 2) // TICK_US)
+            stop_us = None
+            if self._decision.timing.hover_us >= 0:
+                stop_us = sent_us + self._decision.timing.hold_us + self._decision.timing.hover_us
+            self._companions.decided(decision.setpoint.copy(), t2_us.copy(), sent_us, stop_us)
+            self._look_ahead(self.fleet.verdict == Verdict.FLYING)
+
+    def _draw(self) -> None:
+        """Draw latencies and errors ahead for those whose decisions have none left."""
+        if self._before_draw > 0:
+            self._before_draw -= 1
+            return
+        self._delays.draw(self._number)
+        self._telemetry.draw(self._number + 1)
+        then = self._number + 1
+        self._before_draw = int(np.minimum(-then % BLOCK, -(then + 1) % BLOCK).min())
+
+    def _room_for_status(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        return np.empty((len(Flights._fields) - 1, self.n)), np.empty((3, self.n), np.int64)
+
+    def _moving(self) -> Seen:
+        """Return when and where the vehicles are."""
+        fleet = self.fleet
+        return Seen(fleet.time_us, fleet.position, fleet.quaternion, fleet.velocity, fleet.omega)
+
+    def _made_world(self) -> World:
+        """Return what the kernels work on: made anew where an arena or its meshes may be."""
+        eye = self.cameras.eye
+        self._world = World(
+            *(self.fleet, self._places.batch, self._vehicle, self._rules, self._decision),
+            *(self._delays.block, self._extra_us, self._number, self._winds.air, self._drift),
+            *(eye, self._encoding, self._reward, self.spec.episode.hold_s),
+            self._lanes,
+        )
+        return self._world
+
+    def compile_dynamics(self) -> None:
+        """Compile how decisions are flown, or load it; nobody flies."""
+        fly(
+            *(self.fleet, self._places.batch, np.zeros(self.n, np.int64), self._vehicle),
+            *(self._rules, self._winds.air, self._decision, self._lanes),
+        )
 
     def _look_ahead(self, who: NDArray[np.bool_]) -> None:
         """Let the companions in `who` see what their next decisions will act on."""
@@ -414,7 +493,7 @@ class Navigation(Stateful):
                 "seeds": self.seeds,
                 "zones": self.zones,
                 "begun": self._places.begun,
-                "decision": self._decision,
+                "decision": self._number,
                 "extra_us": self._extra_us,
             },
             # Its room is looked for anew.
@@ -426,8 +505,15 @@ class Navigation(Stateful):
         # What a checkpoint of an environment without them does not have.
         if not self._winds.calm:
             held["winds"] = self._winds
-        if self.by_rates or isinstance(self._timing, PipelinedTiming):
-            held["timing"] = self._timing
+        decision = self._decision
+        timing: dict[str, Any] = {}
+        if self._decision.timing.pipelined:
+            timing = {"left": decision.left, "in_flight": decision.in_flight}
+        if self.by_rates:
+            rates = (decision.newest, decision.wanted, decision.sent_us)
+            timing["rates"] = dict(zip(("newest", "wanted", "sent_us"), rates, strict=True))
+        if timing:
+            held["timing"] = timing
         held |= self._companions.held()
         return held
 
@@ -440,69 +526,12 @@ class Navigation(Stateful):
         super().set_state(state)
         self._places.restore()
         self.fleet.room[:] = 0.0
+        self._before_draw, self._world, self._status = 0, None, None
+        self._encoded = None
 
-    def holding_altitude(self) -> NDArray[np.float64]:
-        """Return the downward speeds (n,) [m/s] that hold the altitude."""
-        down = self._telemetry.position(self.fleet.position)[:, 2]
-        return vertical_speeds(self.spec.episode.altitude_m, down)
-
-    def advance(self, ticks: NDArray[np.int64]) -> None:
-        """Advance all flights by ticks (n,); the only place where time passes."""
-        to_freeze = self.cameras.ticks_to_freeze(self.fleet.time_us)
-        while to_freeze is not None and (to_freeze <= ticks).any():
-            part = np.minimum(ticks, to_freeze)
-            self._advance(part)
-            self.cameras.freeze(self.fleet, self._places.batch, self.seeds)
-            ticks = ticks - part
-            to_freeze = self.cameras.ticks_to_freeze(self.fleet.time_us)
-        self._advance(ticks)
-
-    def advance_in_legs(self, ticks: NDArray[np.int64], setpoints: NDArray[np.float64]) -> bool:
-        """Fly all flights in three legs, if they can be; see `timing.Vehicles`."""
-        watched = self._trace is not None or self.cameras.may_freeze
-        # Between legs only places and attitudes are kept, not how the vehicles move.
-        watched |= self.cameras.exposed_in_motion
-        if watched or not self._winds.calm or not ticks[:, 0].all():
-            return False
-        fleet = self.fleet
-        # Those that do not fly take both where they are.
-        give(fleet, setpoints, fleet.verdict != Verdict.FLYING)
-        legs = Legs(
-            ticks,
-            setpoints,
-            fleet.time_us.copy(),
-            fleet.position.copy(),
-            fleet.quaternion.copy(),
-        )
-        advance(
-            fleet, self._places.batch, ticks.sum(axis=1), self._vehicle, self._rules, None, legs
-        )
-        seen = fleet._replace(
-            time_us=legs.seen_us, position=legs.seen_position, quaternion=legs.seen_quaternion
-        )
-        everyone = np.ones(self.n, np.bool_)
-        self.cameras.capture(seen, self._places.batch, everyone, self.seeds)
-        move_all_obstacles(self._places.batch, fleet.time_us)
-        return True
-
-    def _advance(self, ticks: NDArray[np.int64]) -> None:
-        if not ticks.any():
-            return
-        if self._trace is not None:
-            self._trace.advance(self.fleet, ticks, self._fly)
-        else:
-            self._fly(ticks)
-
-    def _fly(self, ticks: NDArray[np.int64]) -> None:
-        def fly(ticks: NDArray[np.int64], air: NDArray[np.float64] | None) -> None:
-            advance(self.fleet, self._places.batch, ticks, self._vehicle, self._rules, air)
-
-        self._winds.fly(self.fleet, ticks, fly)
-
-    def capture(self, who: NDArray[np.bool_]) -> None:
-        """Take the frames of those in `who` (n,), from where they are now."""
-        if self._trace is not None:
-            self._trace.captured(self.fleet, who)
-        if (self.fleet.time_us[who] == 0).any():
-            self.cameras.freeze(self.fleet, self._places.batch, self.seeds)
-        self.cameras.capture(self.fleet, self._places.batch, who, self.seeds)
+    def _take_frames(self, who: NDArray[np.bool_]) -> None:
+        """Take the frames of those in `who` (n,), from where they were when these were due."""
+        seen, arenas = self._decision.seen, self._places.batch
+        if self.cameras.may_freeze and (seen.time_us[who] == 0).any():
+            self.cameras.freeze(self.fleet, arenas, self.seeds)
+        self.cameras.capture(seen, arenas, who, self.seeds)

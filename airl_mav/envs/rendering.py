@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 from airl_mav.arena.draw import GRID_COLOUR, MOVING_COLOURS, START_COLOUR, TEXT_COLOUR, draw_arena
 from airl_mav.arena.geometry import Arena, Obstacles, Shape
 from airl_mav.core.errors import UsageError
-from airl_mav.envs.fleet import Verdict
-from airl_mav.envs.navigation import Flights
+from airl_mav.envs.fleet import Flights, Verdict
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.profiles.camera_kind import CameraKind
 

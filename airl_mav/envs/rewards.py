@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,9 +21,9 @@ from numpy.typing import NDArray
 
 from airl_mav.core import plugins
 from airl_mav.core.errors import FieldError, UsageError
-from airl_mav.envs.fleet import Verdict
-from airl_mav.envs.navigation import Flights
-from airl_mav.envs.spec import Costs
+from airl_mav.core.kernels import kernel
+from airl_mav.envs.fleet import Flights, Verdict
+from airl_mav.envs.spec import SHIPPED_REWARDS, Costs
 from airl_mav.policy.action_sets import PAPER_SPEED_M_S
 from airl_mav.policy.actions import BodyRates
 
@@ -50,6 +51,10 @@ PACE_M_S, PACE_SPREAD_M_S = 4.0, 12.0
 PAPER_BONUS = 1000.0
 
 J_PER_KJ = 1000.0
+
+_SHAPED, _TIMED, _PROGRESS, _PACED, _, _PAPER = range(len(SHIPPED_REWARDS))
+_SUCCESS, _COLLISION = int(Verdict.SUCCESS), int(Verdict.COLLISION)
+_BATTERY = int(Verdict.BATTERY)
 
 
 @dataclass(frozen=True)
@@ -89,88 +94,52 @@ Reward = Callable[[Step], NDArray[np.float64]]
 """Returns the rewards (n,) of a decision, of each vehicle from its own row alone."""
 
 
-def shaped(step: Step) -> NDArray[np.float64]:
-    """Return 1 for the goal, -1 for a failure, a little for progress, less for the time."""
-    return _ended(step) + PROGRESS_1_M * step.progress_m - DECISION_COST
+@kernel
+def pay(
+    name: int, verdict: int, before_m: float, now_m: float, passed_s: float, speed_m_s: float,
+    turned: float, hold_s: float,
+) -> float:  # fmt: skip
+    """Return a shipped reward of one vehicle's decision; a timeout is no failure.
 
-
-def timed(step: Step) -> NDArray[np.float64]:
-    """Return 1 for the goal, -3 for a failure, a little for progress, less for every second."""
-    passed_s = step.now.time_s - step.before.time_s
-    ended = step.success - FAILURE_COST * step.failure
-    return ended + PROGRESS_1_M * step.progress_m - TIME_COST_1_S * passed_s
-
-
-def progress(step: Step) -> NDArray[np.float64]:
-    """Return 4 for the goal, -4 for a failure, much for progress, less for time and turning.
-
-    For policies that decide with every image, as those that command body rates: what a decision is
-    worth is seen in its progress (Song et al., Autonomous Drone Racing with Deep Reinforcement
-    Learning, IROS 2021, eq. 3). Of other actions the yaw rate is what turns.
+    `name` is the index in `SHIPPED_REWARDS`; `verdict`, the distance to the goal `now_m` and
+    `speed_m_s` are those of its end, `before_m` of its begin. `turned` is the sum of the squares of
+    the commanded rates [rad²/s²].
     """
-    passed_s = step.now.time_s - step.before.time_s
-    ended = AGILE_BONUS * _ended(step) - AGILE_TURN * _turned(step)
-    found: NDArray[np.float64] = ended + AGILE_1_M * step.progress_m - AGILE_1_S * passed_s
-    return found
+    success = 1.0 if verdict == _SUCCESS else 0.0
+    failure = 1.0 if verdict in (_COLLISION, _BATTERY) else 0.0
+    ended, nearer_m = success - failure, before_m - now_m
+    if name == _SHAPED:
+        return ended + PROGRESS_1_M * nearer_m - DECISION_COST
+    if name == _TIMED:
+        ended = success - FAILURE_COST * failure
+        return ended + PROGRESS_1_M * nearer_m - TIME_COST_1_S * passed_s
+    if name == _PROGRESS:
+        # Song et al., Autonomous Drone Racing with Deep Reinforcement Learning, IROS 2021, eq. 3.
+        ended = AGILE_BONUS * ended - AGILE_TURN * turned
+        return ended + AGILE_1_M * nearer_m - AGILE_1_S * passed_s
+    if name == _PACED:
+        # Where haste pays, full thrust is learnt first: then nothing is seen but the ground, and no
+        # gradient leads back from beyond the range of an action.
+        worth = min(max(1.0 - (speed_m_s - PACE_M_S) / PACE_SPREAD_M_S, 0.0), 1.0)
+        nearer_m = min(nearer_m, PACE_M_S * passed_s) * worth
+        return AGILE_BONUS * ended + AGILE_1_M * nearer_m - AGILE_TURN * turned
+    # Krishnan et al. 2021, appendix B, eqs. 2 and 3: r = 1000 a - 1000 b - D_g + g D_c. As printed,
+    # D_c = (V_max - V_now) t_max is added, and only on the way to the goal: it pays slowness there,
+    # although the text calls it a penalty on speeding away. V_max is 5 m/s for every action set.
+    correction = (PAPER_SPEED_M_S - speed_m_s) * hold_s
+    paid = PAPER_BONUS * ended - now_m + (correction if now_m < before_m else 0.0)
+    return paid if name == _PAPER else paid / PAPER_BONUS
 
 
-def paced(step: Step) -> NDArray[np.float64]:
-    """Return as `progress`, but for no haste: for policies that must see obstacles in time.
-
-    Time costs nothing, progress is paid up to 4 m/s, and the less of it the faster the vehicle
-    flies, none from 16 m/s on. Where haste pays, full thrust is learnt first: then nothing is seen
-    but the ground, and no gradient leads back from beyond the range of an action.
-    """
-    passed_s = step.now.time_s - step.before.time_s
-    worth = np.clip(1.0 - (step.now.speed_m_s - PACE_M_S) / PACE_SPREAD_M_S, 0.0, 1.0)
-    nearer_m = np.minimum(step.progress_m, PACE_M_S * passed_s) * worth
-    found: NDArray[np.float64] = (
-        AGILE_BONUS * _ended(step) + AGILE_1_M * nearer_m - AGILE_TURN * _turned(step)
-    )
-    return found
-
-
-def paper(step: Step) -> NDArray[np.float64]:
-    """Return r = 1000 a - 1000 b - D_g + g D_c (Krishnan et al. 2021, appendix B, eqs. 2, 3).
-
-    a: goal reached, b: collision, D_g: distance to the goal, D_c = (V_max - V_now) t_max with
-    t_max the time an action is held, g: 1 when closer to the goal than before.
-
-    As printed, D_c is added, and only on the way to the goal: it pays slowness there, although
-    the text calls it a penalty on speeding away. V_max is 5 m/s whatever the action set; who is
-    faster pays. Running out of time costs nothing, and every decision costs its distance.
-    """
-    before_m, now_m = step.before.goal_distance_m, step.now.goal_distance_m
-    correction = (PAPER_SPEED_M_S - step.now.speed_m_s) * step.hold_s
-    paid: NDArray[np.float64] = PAPER_BONUS * _ended(step) - now_m + (now_m < before_m) * correction
-    return paid
-
-
-def paper_scaled(step: Step) -> NDArray[np.float64]:
-    """Return `paper`, divided by 1000."""
-    return paper(step) / PAPER_BONUS
-
-
-def _turned(step: Step) -> NDArray[np.float64]:
-    """Return the squares (n,) of the rates that are commanded [rad²/s²]."""
+def _shipped(name: int, step: Step) -> NDArray[np.float64]:
+    """Return `pay` of n vehicles."""
+    before, now = step.before, step.now
     by_rates = step.commands.shape[1] == len(BodyRates._fields)
-    rates = step.commands[:, :3] if by_rates else step.commands[:, 2:]
-    squares: NDArray[np.float64] = np.square(rates).sum(axis=1)
-    return squares
-
-
-def _ended(step: Step) -> NDArray[np.float64]:
-    return step.success.astype(np.float64) - step.failure
-
-
-SHIPPED: dict[str, Reward] = {
-    "shaped": shaped,
-    "timed": timed,
-    "progress": progress,
-    "paced": paced,
-    "paper-scaled": paper_scaled,
-    "paper": paper,
-}
+    turned = np.square(step.commands[:, :3] if by_rates else step.commands[:, 2:]).sum(axis=1)
+    columns = (before.goal_distance_m, now.goal_distance_m, now.time_s - before.time_s)
+    rows = np.stack([*columns, now.speed_m_s, turned], axis=1, dtype=np.float64).tolist()
+    verdicts = zip(now.verdict.tolist(), rows, strict=True)
+    return np.array([pay(name, verdict, *[*row, step.hold_s]) for verdict, row in verdicts])
 
 
 def reward_of(name: str) -> Reward:
@@ -179,8 +148,8 @@ def reward_of(name: str) -> Reward:
     Raises:
         FieldError: There is no such reward, or it cannot be made.
     """
-    if name in SHIPPED:
-        return SHIPPED[name]
+    if name in SHIPPED_REWARDS:
+        return partial(_shipped, SHIPPED_REWARDS.index(name))
     found = plugins.load_part(plugins.REWARDS, name)
     try:
         own = found() if isinstance(found, type) else found

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import quat_yaw
 from airl_mav.envs.decisions import (
+    FLYING,
     Decisions,
     action_space,
     draw_seeds,
@@ -19,10 +20,10 @@ from airl_mav.envs.decisions import (
     outcome,
     zone_option,
 )
-from airl_mav.envs.fleet import Verdict
-from airl_mav.envs.navigation import Flights
+from airl_mav.envs.fleet import Flights
 from airl_mav.envs.rendering import RENDER_MODES, Moment, Pictures
 from airl_mav.envs.spec import EnvironmentSpec
+from airl_mav.envs.world import GOES_ON, TERMINATED, TRUNCATED
 from airl_mav.policy.layouts import newest_frame
 from airl_mav.policy.observation_spec import Encoded
 
@@ -91,13 +92,14 @@ class NavigationEnv(Decisions, gym.Env[Encoded, Any]):
             ResetNeeded: No episode has begun, or it has ended.
             InvalidAction: The action is none of the set; numbers beyond -1..1 are cut off.
         """
-        if self._before is not None and self._before.verdict[0] != Verdict.FLYING:
+        if self._before is not None and self._before.verdict[0] != FLYING:
             raise gym.error.ResetNeeded("step() after the end of the episode")
-        now, reward, terminated, truncated = self._decide(action, ())
+        now, reward, ending = self._decide(action, ())
+        how = ending.item()
         info = self._info(now)
-        if terminated[0] or truncated[0]:
+        if how != GOES_ON:
             info |= outcome(now, 0)
-        return self._observe(), float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
+        return self._observe(), reward.item(), how == TERMINATED, how == TRUNCATED, info
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return the picture (540, 960, 3) of now with `rgb_array`; a window is shown by itself."""
@@ -127,4 +129,4 @@ class NavigationEnv(Decisions, gym.Env[Encoded, Any]):
         )
 
     def _info(self, now: Flights) -> dict[str, Any]:
-        return {key: value[0].item() for key, value in self._quality(now).items()}
+        return {key: value.item() for key, value in self._quality(now).items()}

@@ -346,35 +346,23 @@ class EnvironmentSpec(ProfileModel):
     )
 
     @model_validator(mode="after")
-    def _decides_in_time(self) -> EnvironmentSpec:
+    def _fits_together(self) -> EnvironmentSpec:
         if self.episode.hold_s >= self.episode.time_limit_s:
             raise ValueError(
                 f"episode.hold_s = {self.episode.hold_s:g}: accepted: value < "
                 f"{self.episode.time_limit_s:g} s (episode.time_limit_s)"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _hovers_between_decisions(self) -> EnvironmentSpec:
         if self.decisions == "pipelined" and self.episode.hover_after_s is not None:
             raise ValueError(
                 "decisions = 'pipelined': with episode.hover_after_s: accepted: one of them, as no"
                 " hold ends"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _waits_for_its_hold(self) -> EnvironmentSpec:
         timeout_s, held_s = self.episode.decision_timeout_s, self.episode.hold_s
         if self.decisions == "sequential" and timeout_s is not None and timeout_s <= held_s:
             raise ValueError(
                 f"episode.decision_timeout_s = {timeout_s:g}: accepted: value > {held_s:g} s"
                 " (episode.hold_s), or every decision is overdue"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _sees_by_further_cameras(self) -> EnvironmentSpec:
         if self.cameras and self.layout == "paper":
             raise ValueError(
                 f"cameras = {', '.join(self.cameras)}: accepted: none with layout 'paper'"
@@ -384,27 +372,17 @@ class EnvironmentSpec(ProfileModel):
                 "compensate = true: accepted: false with further cameras, whose images are not"
                 " carried forward"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _commands_body_rates(self) -> EnvironmentSpec:
-        if self.actions != BODY_RATES:
-            return self
         for name, value, usual in (
             ("compensate", self.compensate, False),
             ("safe_velocity", self.safe_velocity, None),
             ("costs.command_step", self.costs.command_step, 0.0),
             ("costs.turn_step", self.costs.turn_step, 0.0),
         ):
-            if value != usual:
+            if self.actions == BODY_RATES and value != usual:
                 raise ValueError(
                     f"{name} = {value!r}: accepted: {usual!r} with actions {BODY_RATES!r}, which"
                     " command no velocity"
                 )
-        return self
-
-    @model_validator(mode="after")
-    def _told_of_heights(self) -> EnvironmentSpec:
         if self.goal_height and self.layout == "paper":
             raise ValueError("goal_height = true: accepted: false with layout 'paper'")
         return self

@@ -5,18 +5,15 @@ The files are those of a rehearsal (docs/run-folder.md), so that one report serv
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.core.constants import TICK_US, US_PER_S, CommandKind
+from airl_mav.core.constants import US_PER_S, CommandKind
 from airl_mav.envs.fleet import Fleet, Verdict
 from airl_mav.flight.trajectory import SAMPLE_US, Trajectory
 from airl_mav.latency.stamps import NO_STAMP, SETPOINTS
-
-SAMPLE_TICKS = SAMPLE_US // TICK_US
 
 STATE = 12
 """Columns of a sample: time [µs], position, velocity, quaternion, mean power. Whole microseconds
@@ -71,7 +68,6 @@ class Trace:
         self._setpoints = _Tables(n, 4, np.float32)
         self._sampled_us = np.zeros(n, np.int64)
         self._sampled_j = np.zeros(n)
-        self._capture_us = np.zeros(n, np.int64)
         self._deciding = self._started_us = np.zeros(0, np.int64)
         self.seen_us = np.zeros(n, np.int64)
         """(n,) when the frames were taken that are being decided on [µs]."""
@@ -82,26 +78,15 @@ class Trace:
             tables.clear(i)
         self._take(fleet, np.array([i]))
 
-    def advance(
-        self, fleet: Fleet, ticks: NDArray[np.int64], fly: Callable[[NDArray[np.int64]], None]
-    ) -> None:
-        """Advance all flights in steps that end on the samples.
+    def next_us(self, fleet: Fleet) -> NDArray[np.int64]:
+        """Return when the next samples are due (n,) [µs]."""
+        return (fleet.time_us // SAMPLE_US + 1) * SAMPLE_US
 
-        Args:
-            fleet: Read after each step.
-            ticks: (n,) how many ticks each vehicle flies.
-            fly: Flies every vehicle that still does for its number of ticks (n,).
-        """
-        left = np.where(fleet.verdict == Verdict.FLYING, ticks, 0)
-        while left.any():
-            to_sample = SAMPLE_TICKS - fleet.time_us // TICK_US % SAMPLE_TICKS
-            part = np.minimum(left, to_sample)
-            fly(part)
-            ended = fleet.verdict != Verdict.FLYING
-            # A flight's last moment is kept wherever it falls, as `TrajectoryRecorder` does.
-            due = (fleet.time_us % SAMPLE_US == 0) | ended
-            self._take(fleet, np.flatnonzero(due & (fleet.time_us > self._sampled_us)))
-            left = np.where(ended, 0, left - part)
+    def sample(self, fleet: Fleet) -> None:
+        """Sample the flights that have come to the time of a sample, or to their end."""
+        # A flight's last moment is kept wherever it falls, as `TrajectoryRecorder` does.
+        due = (fleet.time_us % SAMPLE_US == 0) | (fleet.verdict != Verdict.FLYING)
+        self._take(fleet, np.flatnonzero(due & (fleet.time_us > self._sampled_us)))
 
     def _take(self, fleet: Fleet, who: NDArray[np.int64]) -> None:
         """Sample the vehicles of `who` (k,)."""
@@ -113,15 +98,10 @@ class Trace:
         self._samples.append(who, np.column_stack([now, *state, mean_w]))
         self._sampled_us[who], self._sampled_j[who] = now, fleet.energy[who]
 
-    def captured(self, fleet: Fleet, who: NDArray[np.bool_]) -> None:
-        """Note that the cameras of `who` (n,) have just taken their frames."""
-        self._capture_us[who] = fleet.time_us[who]
-
-    def deciding(self, fleet: Fleet) -> None:
-        """Note that every flight that goes on begins a decision, on its newest frame."""
+    def deciding(self, fleet: Fleet, seen_us: NDArray[np.int64]) -> None:
+        """Note that every flight that goes on begins a decision, on a frame of that time (n,)."""
         self._deciding = np.flatnonzero(fleet.verdict == Verdict.FLYING)
-        self._started_us = fleet.time_us.copy()
-        self.seen_us = self._capture_us.copy()
+        self._started_us, self.seen_us = fleet.time_us.copy(), seen_us.copy()
 
     def decided(
         self,

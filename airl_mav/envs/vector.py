@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from airl_mav.core.errors import UsageError
 from airl_mav.envs.decisions import (
+    FLYING,
     Decisions,
     action_space,
     draw_seeds,
@@ -22,8 +23,7 @@ from airl_mav.envs.decisions import (
     outcome,
     zone_option,
 )
-from airl_mav.envs.fleet import Verdict
-from airl_mav.envs.navigation import Flights
+from airl_mav.envs.fleet import Flights, Verdict
 from airl_mav.envs.saved_state import (
     State,
     Stateful,
@@ -35,6 +35,7 @@ from airl_mav.envs.saved_state import (
     unpack_generators,
 )
 from airl_mav.envs.spec import EnvironmentSpec, spec_of
+from airl_mav.envs.world import GOES_ON, TERMINATED, TRUNCATED
 from airl_mav.policy.observation_spec import Encoded
 
 AHEAD = 32
@@ -167,9 +168,9 @@ class NavigationVectorEnv(Decisions, Stateful, VectorEnv[Encoded, NDArray[Any], 
         over = self._over()
         if over.any() and self.autoreset_mode == AutoresetMode.DISABLED:
             raise gym.error.ResetNeeded("step() after the end of an episode")
-        now, reward, terminated, truncated = self._decide(actions, (self.num_envs,))
+        now, reward, ending = self._decide(actions, (self.num_envs,))
         seen = self.navigation.observe()
-        ended = terminated | truncated
+        ended = ending != GOES_ON
         final: dict[str, Any] = {}
         begun = over
         if self.autoreset_mode == AutoresetMode.SAME_STEP:
@@ -184,13 +185,14 @@ class NavigationVectorEnv(Decisions, Stateful, VectorEnv[Encoded, NDArray[Any], 
             now = self._begin(slots, self._next_seeds(len(slots)))
             for key, first in self.navigation.observe(slots).items():
                 seen[key][slots] = first
-        return seen, reward, terminated, truncated, _masked(self._quality(now)) | final
+        info = _masked(self._quality(now)) | final
+        return seen, reward, ending == TERMINATED, ending == TRUNCATED, info
 
     def _over(self) -> NDArray[np.bool_]:
         """Return (n,) which flights have ended in an earlier step and not begun anew."""
         if self._before is None:
             return np.zeros(self.num_envs, np.bool_)
-        over: NDArray[np.bool_] = self._before.verdict != Verdict.FLYING
+        over: NDArray[np.bool_] = self._before.verdict != FLYING
         return over
 
     def _next_seeds(self, n: int) -> list[int]:
@@ -268,7 +270,8 @@ def _masked(
 ) -> dict[str, Any]:
     """Add masks of the rows that are told, all of them by default; the others become 0 or None."""
     if told is None:
-        return values | {f"_{key}": np.ones(len(value), np.bool_) for key, value in values.items()}
+        every = np.ones(len(values["seed"]), np.bool_)
+        return values | dict.fromkeys([f"_{key}" for key in values], every)
     rows = {
         key: value if value.dtype == object else np.where(told, value, np.zeros_like(value))
         for key, value in values.items()

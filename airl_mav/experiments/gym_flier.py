@@ -9,7 +9,7 @@ from typing import Any
 
 from airl_mav.arena.geometry import Arena
 from airl_mav.core.constants import US_PER_S
-from airl_mav.envs.contact import CEILING, FLOOR, WALL
+from airl_mav.envs.arenas import CEILING, FLOOR, WALL
 from airl_mav.envs.evaluation import (
     OUTCOMES,
     EpisodeResult,
@@ -19,7 +19,8 @@ from airl_mav.envs.evaluation import (
     fly_seeds,
 )
 from airl_mav.envs.faults import acted
-from airl_mav.envs.navigation import Flights, Navigation
+from airl_mav.envs.fleet import Flights
+from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec, spec_of
 from airl_mav.envs.trace import Trace
 from airl_mav.experiments.executors import Stop

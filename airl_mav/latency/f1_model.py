@@ -3,7 +3,7 @@
 Krishnan et al., "The Sky Is Not the Limit: A Visual Performance Model for Cyber-Physical Co-Design
 in Autonomous Machines", IEEE Computer Architecture Letters 19, 2020, after Liu et al., ICRA 2016;
 Air Learning scales its actions by it. Its deceleration is one number. A vehicle that has to tilt
-first takes a longer way to stand: `envs.braking` measures it.
+first takes a longer way to stand: `envs.stopping` measures it.
 """
 
 from __future__ import annotations

@@ -20,13 +20,13 @@ from airl_mav.envs.decisions import (
     observation_space,
     zone_option,
 )
-from airl_mav.envs.delay import bounded, injections_of
 from airl_mav.envs.draws import source_of
-from airl_mav.envs.navigation import Flights
+from airl_mav.envs.fleet import Flights
 from airl_mav.envs.rendering import RENDER_MODES, Pictures
 from airl_mav.envs.rewards import Step, costs, reward_of
 from airl_mav.envs.sight import sight_of
 from airl_mav.envs.spec import EnvironmentSpec, gymnasium_spec
+from airl_mav.envs.stopping import bounded, injections_of
 from airl_mav.flight.judge import Outcome
 from airl_mav.lockstep.asked_flight import AskedFlight
 from airl_mav.lockstep.spec_scenario import BESIDE, scenario_of

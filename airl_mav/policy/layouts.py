@@ -57,6 +57,9 @@ SPEED_SCALE_M_S = 5.0
 DISTANCE_SCALE_M = 20.0
 """`body`: the distance to the goal is divided by this."""
 
+LEAST_DISTANCE_M = 1e-6
+"""A goal that is nearer has no bearing [m]."""
+
 HEIGHT_SCALE_M = 5.0
 """How far the goal lies below the vehicle is divided by this, and how high that is."""
 
@@ -128,7 +131,7 @@ def encode_layout(spec: ObservationSpec, seen: Observation, shrink: Shrink = NUM
     distance = np.hypot(seen.goal[:, 0], seen.goal[:, 1])
     image = _scans(spec, seen, shrink) if spec.layout == "scan" else _images(spec, seen, shrink)
     if spec.layout != "paper":
-        safe = np.maximum(distance, 1e-6)
+        safe = np.maximum(distance, LEAST_DISTANCE_M)
         goal = np.stack(
             [seen.goal[:, 0] / safe, seen.goal[:, 1] / safe, distance / DISTANCE_SCALE_M], axis=1
         )

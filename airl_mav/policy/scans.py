@@ -5,7 +5,7 @@ return is of those that are about as high as the camera. It is what a planar lid
 platform measures, and what MAVLink's OBSTACLE_DISTANCE carries. Earlier scans are carried by the
 vehicle's own motion since: what stands is then where it is in the newest, and the rest has moved.
 
-With numpy, as the companion does it; `envs.scanning` has the same as compiled loops.
+With numpy, as the companion does it; `envs.encoding` has the same as compiled loops.
 """
 
 from __future__ import annotations

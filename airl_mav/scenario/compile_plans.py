@@ -15,7 +15,7 @@ _VECTORIZED = "airl_mav.envs.warm_up"
 def plan_of(scenario: ResolvedScenario) -> CompilePlan:
     """Return what a scenario needs at its level."""
     if scenario.level == "gym":
-        return vectorized_plan(scenario.vehicle.camera.kind, recorded=True)
+        return vectorized_plan(scenario.vehicle.camera.kind)
     return flight_plan(scenario.vehicle, scenario.scenario.plant)
 
 
@@ -35,20 +35,14 @@ def flight_plan(vehicle: VehicleProfile, plant: PlantName) -> CompilePlan:
     )
 
 
-def vectorized_plan(kind: CameraKind, *, recorded: bool) -> CompilePlan:
-    """Return what level gym needs, whose flights are recorded, or a training.
-
-    Args:
-        kind: Of the main camera's images.
-        recorded: Whether flights are recorded.
-    """
-    how = {"recorded": recorded}
+def vectorized_plan(kind: CameraKind) -> CompilePlan:
+    """Return what level gym and a training need, by the kind of the main camera's images."""
     return CompilePlan(
         "vectorized",
-        f"{kind}-{'recorded' if recorded else 'training'}",
+        kind,
         (
             CompileJob(f"{_VECTORIZED}:compile_images", {"kind": kind}, 49),
-            CompileJob(f"{_VECTORIZED}:compile_dynamics", how, 102),
+            CompileJob(f"{_VECTORIZED}:compile_dynamics", {}, 102),
         ),
-        CompileJob(f"{_VECTORIZED}:compile_vectorized", {"kind": kind, **how}, 5),
+        CompileJob(f"{_VECTORIZED}:compile_vectorized", {"kind": kind}, 5),
     )

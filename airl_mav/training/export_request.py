@@ -317,7 +317,7 @@ def _environment(name: str) -> EnvironmentSpec:
     environment = load_profile("training", name, TrainingConfig).environment
     if environment.safe_velocity is None:
         return environment
-    from airl_mav.envs.delay import bounded
+    from airl_mav.envs.stopping import bounded
 
     return bounded(environment)
 

@@ -23,12 +23,12 @@ from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.files import replace_file
 from airl_mav.core.provenance import package_versions
 from airl_mav.envs.decisions import FIRST_TRAINING_SEED, LAST_TRAINING_SEED
-from airl_mav.envs.delay import bounded
 from airl_mav.envs.evaluation import EpisodeResult, fly_episodes, mean_of_successes, success_rate
 from airl_mav.envs.fleet import Verdict
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.sb3 import NavigationVecEnv, Watcher
 from airl_mav.envs.spec import EnvironmentSpec, Randomisation
+from airl_mav.envs.stopping import bounded
 from airl_mav.envs.vector import NavigationVectorEnv
 from airl_mav.policy.card import PolicyCard, PolicyFacts, Training
 from airl_mav.policy.observation_spec import SHIPPED

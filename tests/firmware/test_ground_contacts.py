@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena, Obstacles
 from airl_mav.arena.ground import Ground
-from airl_mav.envs.contact import NOTHING, touches
+from airl_mav.envs.arenas import NOTHING, touches
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from firmware_sim.interfaces import ActuatorControls

@@ -11,7 +11,8 @@ from airl_mav.camera.frame import Frame
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import Motion, Mount
 from airl_mav.envs.arenas import batch_of
-from airl_mav.envs.cameras import lens_of, render_images
+from airl_mav.envs.cameras import Eye, render_images
+from airl_mav.envs.colour_images import lens_of
 from airl_mav.envs.encoding import COMPILED
 from airl_mav.envs.evaluation import SinglePilots, fly_seeds
 from airl_mav.envs.fleet import Verdict, new_fleet
@@ -70,7 +71,10 @@ def test_the_companion_gets_the_images_that_the_twin_renders(
         fleet.position[0], fleet.quaternion[0] = poses[capture_us]
         fleet.time_us[0] = capture_us - flown.record.started_us
         render_images(
-            fleet, arenas, np.ones(1, np.bool_), mount, lens_of(lens, camera.range_m), twin, None
+            fleet,
+            arenas,
+            np.ones(1, np.bool_),
+            Eye(mount, lens_of(lens, camera.range_m), twin, None),
         )
         assert each.depth_mm.tobytes() == twin[0].tobytes()
     # It is a picture, of all sides, and another one each time.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -16,10 +15,19 @@ from airl_mav.control.demand import KIND_US
 from airl_mav.core.constants import TICK_US, US_PER_MS, US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import quats_to_euler
-from airl_mav.envs.fleet import Verdict, new_fleet
+from airl_mav.envs.decision import (
+    RATES_FOLLOWED_US,
+    FrameTimes,
+    Timing,
+    expire,
+    new_decision,
+    next_stretch,
+    take,
+)
+from airl_mav.envs.faults import delays_of
+from airl_mav.envs.fleet import ROWS, Verdict, new_fleet
 from airl_mav.envs.navigation import Navigation
-from airl_mav.envs.rate_setpoints import RATES_FOLLOWED_US, RateSetpoints
-from airl_mav.envs.rewards import Step, paced, progress
+from airl_mav.envs.rewards import Step, reward_of
 from airl_mav.envs.spec import EnvironmentSpec, spec_of
 from companion.mavsdk_link import OFFBOARD_SETTLE_S
 
@@ -85,13 +93,28 @@ def test_what_is_commanded_turns_as_commanded() -> None:
 
 
 class Clockwork:
-    """Vehicles of which only the time goes on."""
+    """Vehicles in the middle of a long decision, of which only the time goes on."""
 
     def __init__(self, n: int) -> None:
-        self.fleet = new_fleet(n)
+        frames = FrameTimes(np.zeros(n, np.int64), 33_333, 5_000, delays_of([]))
+        timing = Timing(True, TICK_US, 500_000, -1, 38, 2.5, delays_of([]), frames)
+        self.fleet, self._decision = new_fleet(n), new_decision(timing, np.zeros((n, 9)))
+        self._state = np.zeros((ROWS, 1))
+        self._decision.tick[:], self._decision.events[:] = 1 << 30, 1
 
-    def advance(self, ticks: np.ndarray) -> None:
-        self.fleet.time_us[:] += TICK_US * ticks
+    def fly(self, until_ms: int) -> tuple[float, bool, tuple[float, ...]]:
+        self._decision.pause_us[:] = until_ms * US_PER_MS
+        for i in range(len(self.fleet.time_us)):
+            while ticks := next_stretch(self._decision, self.fleet, i, self._state, 0):
+                self.fleet.time_us[i] += TICK_US * ticks
+        return self.told()
+
+    def take(self, setpoint: tuple[float, ...]) -> None:
+        for i in range(len(self.fleet.time_us)):
+            take(self._decision, self.fleet, np.array(setpoint), i, self._state, 0)
+
+    def expire(self, i: int) -> None:
+        expire(self._decision, self.fleet, i, self._state, 0)
 
     def told(self, i: int = 0) -> tuple[float, bool, tuple[float, ...]]:
         """Return the time [ms], and what vehicle i follows."""
@@ -100,29 +123,23 @@ class Clockwork:
 
 
 def test_kinds_of_setpoints_are_followed_when_px4_publishes_its_control_mode() -> None:
-    vehicles, rates, everyone = Clockwork(2), RateSetpoints(2, 150_000), np.ones(2, np.bool_)
+    vehicles = Clockwork(2)
     turn, end, stand = (0.1, 0.2, 0.3, 0.6), (0.0, 0.0, 0.0, 0.6), (0.0, 0.0, 0.0, 0.0)
-
-    def fly(until_ms: int) -> tuple[float, bool, tuple[float, ...]]:
-        until_us = until_ms * US_PER_MS
-        rates.advance(vehicles, (until_us - vehicles.fleet.time_us) // TICK_US)
-        return vehicles.told()
-
-    fly(100)
-    rates.take(vehicles.fleet, np.tile(turn, (2, 1)), everyone)
+    vehicles.fly(100)
+    vehicles.take(turn)
     assert vehicles.told() == (100.0, False, stand)
     # Not before the tick that begins then.
-    assert fly(400) == (400.0, False, stand)
-    assert fly(404) == (404.0, True, turn)
-    rates.stop(vehicles.fleet, np.array([True, False]))
+    assert vehicles.fly(400) == (400.0, False, stand)
+    assert vehicles.fly(404) == (404.0, True, turn)
+    vehicles.expire(0)
     assert vehicles.told() == (404.0, True, end)
     assert vehicles.told(1) == (404.0, True, turn)
-    assert fly(904) == (904.0, False, stand)
+    assert vehicles.fly(904) == (904.0, False, stand)
     assert vehicles.told(1) == (904.0, True, turn)
-    rates.take(vehicles.fleet, np.tile(turn, (2, 1)), everyone)
-    assert fly(1400) == (1400.0, False, stand)
+    vehicles.take(turn)
+    assert vehicles.fly(1400) == (1400.0, False, stand)
     # Two changes in one go, of which the first is the other's.
-    assert fly(3000) == (3000.0, True, turn)
+    assert vehicles.fly(3000) == (3000.0, True, turn)
     assert vehicles.told(1) == (3000.0, True, turn)
 
 
@@ -237,12 +254,12 @@ def test_the_reward_of_progress_by_hand() -> None:
     commands = np.array([(1.0, -2.0, 0.5, 0.5), HOVER])
     navigation.fly(commands)
     now = navigation.flights()
-    found = progress(Step(before, now, commands, 0.5))
+    found = reward_of("progress")(Step(before, now, commands, 0.5))
     nearer = before.goal_distance_m - now.goal_distance_m
     passed = now.time_s - before.time_s
     by_hand = 0.3 * nearer - 0.1 * passed - 0.002 * np.array([1.0 + 4.0 + 0.25, 0.0])
     np.testing.assert_allclose(found, by_hand)
-    level = progress(Step(before, now, np.array([(3.0, 1.0, 2.0), (0, 0, 0)]), 0.5))
+    level = reward_of("progress")(Step(before, now, np.array([(3.0, 1.0, 2.0), (0, 0, 0)]), 0.5))
     np.testing.assert_allclose(level - found, [0.002 * (5.25 - 4.0), 0.0], atol=1e-12)
     assert math.isfinite(found.sum())
 
@@ -251,9 +268,11 @@ def test_the_reward_without_haste_by_hand() -> None:
     """Three vehicles as fast as 2, 8 and 20 m/s: 1, 2/3 and none of 4 m/s count."""
     navigation, fast = begun(3), np.array([2.0, 8.0, 20.0])
     before, commands = navigation.flights(), np.tile((0.0, 2.0, 0.0, 0.5), (3, 1))
-    now = replace(before, time_s=before.time_s + 0.1, speed_m_s=fast)
-    now = replace(now, goal_distance_m=before.goal_distance_m - 0.1 * fast)
-    found = paced(Step(before, now, commands, 0.5))
+    now = before._replace(time_s=before.time_s + 0.1, speed_m_s=fast)
+    now = now._replace(goal_distance_m=before.goal_distance_m - 0.1 * fast)
+    found = reward_of("paced")(Step(before, now, commands, 0.5))
     np.testing.assert_allclose(found, [0.3 * 0.2 - 0.008, 0.3 * 0.4 * 2 / 3 - 0.008, -0.008])
-    ended = replace(now, verdict=np.array([Verdict.SUCCESS, Verdict.COLLISION, now.verdict[2]]))
-    np.testing.assert_allclose(paced(Step(before, ended, commands, 0.5)) - found, [4.0, -4.0, 0.0])
+    ended = now._replace(verdict=np.array([Verdict.SUCCESS, Verdict.COLLISION, now.verdict[2]]))
+    np.testing.assert_allclose(
+        reward_of("paced")(Step(before, ended, commands, 0.5)) - found, [4.0, -4.0, 0.0]
+    )

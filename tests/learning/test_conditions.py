@@ -13,12 +13,12 @@ from airl_mav.core.constants import GRAVITY_M_S2, TICK_US
 from airl_mav.core.errors import UsageError
 from airl_mav.core.streams import Stream, stream
 from airl_mav.envs.arenas import batch_of
+from airl_mav.envs.draws import Winds
 from airl_mav.envs.fleet import Fleet, hover, new_fleet
 from airl_mav.envs.flight import advance
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec, spec_of
 from airl_mav.envs.trace import Trace
-from airl_mav.envs.winds import Winds
 from airl_mav.experiments.gym_flier import environment_of
 from airl_mav.profiles.conditions import SensorNoise, Spread, WindSettings
 from airl_mav.rehearsal.stand_alone import aircraft_of
@@ -36,6 +36,7 @@ from firmware_sim.plant.camera_server import SimulatedCamera
 from firmware_sim.plant.sensors import SensorSuite
 from firmware_sim.simulation import EpisodeSetup, Simulation
 from tests.learning.test_fleet import ENDLESS, OPEN, QUAD, VEHICLE, PlantPilot, command
+from tests.support.blown import fly_blown
 
 GUSTY = WindSettings(north_m_s=-3.0, east_m_s=2.0, gust_m_s=1.5, gust_time_s=1.0)
 SPREAD = Spread(mass=0.1, thrust=0.1, drag=0.5, rotor_lag=0.3)
@@ -63,15 +64,14 @@ def test_twin_and_plant_fly_the_same_gusts_and_the_same_aircraft(seed: int) -> N
     winds.begin(0, seed)
     hover(fleet, 0, 60.0, VEHICLE, drawn)
 
-    def fly(ticks: np.ndarray, air: np.ndarray | None) -> None:
-        advance(fleet, arenas, ticks, VEHICLE, ENDLESS, air)
-
     rng, off_m = np.random.default_rng(seed), []
     for _ in range(20):
         setpoint = rng.uniform([-2, -2, -0.5, -1.5], [4, 2, 0.5, 1.5])
         command(fleet, 0, setpoint)
         pilot.fly(setpoint, 250)
-        winds.fly(fleet, np.array([250]), fly)
+        fly_blown(
+            winds, fleet, 250, lambda n: advance(fleet, arenas, n, VEHICLE, ENDLESS, winds.air)
+        )
         off_m.append(np.abs(fleet.position[0] - pilot.plant.truth().position).max())
     assert max(off_m) < 1e-6
     assert fleet.energy[0] == pytest.approx(pilot.energy, rel=1e-6)
@@ -93,7 +93,7 @@ def test_a_simulation_draws_what_the_twin_draws() -> None:
         assert row.tolist() == list(plant.record["airframe"][0])
         assert body[0] == row[0] != QUAD.body.mass_kg
         np.testing.assert_allclose(body[2], row[1:4], rtol=1e-12)
-        assert np.array_equal(twin._winds._air[0, 0], plant.wind.step())
+        assert np.array_equal(twin._winds.air[0, 0], plant.wind.step())
         plant.close()
 
 
@@ -152,13 +152,14 @@ def test_the_twin_s_gusts_have_the_spread_and_correlation_time_stated() -> None:
         winds.begin(i, i)
     rows: list[np.ndarray] = []
 
-    def pass_time(ticks: np.ndarray, air: np.ndarray | None) -> None:
+    def pass_time(ticks: np.ndarray) -> None:
+        air = winds.air
         assert air is not None
         tick = fleet.time_us[0] // TICK_US
         rows.extend(air[:, k % BLOCK].copy() for k in range(tick, tick + ticks[0]))
         fleet.time_us[:] += ticks * TICK_US
 
-    winds.fly(fleet, np.full(400, 1100), pass_time)
+    fly_blown(winds, fleet, 1100, pass_time)
     blowing = np.array(rows)
     assert blowing.shape == (1100, 400, 3)
     np.testing.assert_allclose(blowing.mean(axis=(0, 1)), [-3.0, 2.0, 0.0], atol=0.15)

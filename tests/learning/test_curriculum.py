@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from airl_mav.core.errors import UsageError
-from airl_mav.envs.curriculum import CurriculumState, stages_of
+from airl_mav.envs.episode_arenas import CurriculumState, stages_of
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import Curriculum, EnvironmentSpec, spec_of
 from airl_mav.envs.vector import NavigationVectorEnv

@@ -16,7 +16,6 @@ from airl_mav.envs.estimation import (
     N_ERRORS,
     EstimationError,
     perturbed,
-    step_errors,
 )
 from airl_mav.profiles.loading import load_profile, profiles_dir
 from airl_mav.profiles.vehicle import Estimation, VehicleProfile
@@ -26,6 +25,13 @@ from tests.support.flight_rig import Rig, flight, quad, velocity_setpoint
 TABLE = quad().estimation
 assert TABLE is not None
 MODEL = EstimationError.from_profile(TABLE)
+
+
+def step_errors(
+    model: EstimationError, errors: np.ndarray, normals: np.ndarray, dt: float | np.ndarray
+) -> np.ndarray:
+    kept, added = model.step(dt)
+    return kept * errors + added * normals
 
 
 def run(model: EstimationError, flights: int, samples: int, dt: float, seed: int) -> np.ndarray:

@@ -15,8 +15,18 @@ from airl_mav.control.demand import Demand
 from airl_mav.control.memory import new_memory, trim_for_hover
 from airl_mav.core.constants import GRAVITY_M_S2, TICK_S, TICK_US
 from airl_mav.core.frames import heading_to_ned, quat_yaw
-from airl_mav.envs.arenas import ArenaBatch, batch_of, empty_batch, move_obstacles, put_arena
-from airl_mav.envs.contact import FLOOR, NOTHING, WALL, clearance, touches
+from airl_mav.envs.arenas import (
+    FLOOR,
+    NOTHING,
+    WALL,
+    ArenaBatch,
+    batch_of,
+    clearance,
+    empty_batch,
+    move_obstacles,
+    put_arena,
+    touches,
+)
 from airl_mav.envs.fleet import Fleet, Rules, Vehicle, Verdict, hover, new_fleet, vehicle_of
 from airl_mav.envs.flight import REPEAT_US, advance
 from airl_mav.flight.judge import Outcome, Referee, Task, TruthSample

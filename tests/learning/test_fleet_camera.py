@@ -14,7 +14,8 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import Mount, camera_pose, render
 from airl_mav.core.frames import quat_from_euler
 from airl_mav.envs.arenas import batch_of
-from airl_mav.envs.cameras import Lens, lens_of, render_images
+from airl_mav.envs.cameras import Eye, render_images
+from airl_mav.envs.colour_images import Lens, lens_of
 from airl_mav.envs.fleet import Fleet, new_fleet
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
@@ -65,7 +66,9 @@ def test_sees_what_the_rehearsal_s_camera_sees(
 ) -> None:
     fleet, arenas = scattered(np.random.default_rng(1)), batch_of(worlds)
     out = np.full((N, camera.height, camera.width), 7, np.uint16)
-    render_images(fleet, arenas, np.ones(N, np.bool_), MOUNT, lens_of(camera, range_m), out, None)
+    render_images(
+        fleet, arenas, np.ones(N, np.bool_), Eye(MOUNT, lens_of(camera, range_m), out, None)
+    )
     for i, world in enumerate(worlds):
         assert np.array_equal(out[i], expected(world, fleet, i, range_m, camera))
     assert len(np.unique(out)) > 1000  # it is a picture
@@ -75,7 +78,7 @@ def test_only_those_that_look_get_an_image(worlds: list[Arena]) -> None:
     fleet, arenas = scattered(np.random.default_rng(2)), batch_of(worlds)
     out = np.full((N, 48, 64), 7, np.uint16)
     who = np.arange(N) % 3 == 1
-    render_images(fleet, arenas, who, MOUNT, lens_of(CAMERA, 20.0), out, None)
+    render_images(fleet, arenas, who, Eye(MOUNT, lens_of(CAMERA, 20.0), out, None))
     for i, world in enumerate(worlds):
         image = expected(world, fleet, i, 20.0) if who[i] else np.full((48, 64), 7)
         assert np.array_equal(out[i], image)
@@ -92,7 +95,7 @@ def test_obstacles_are_seen_where_they_are_at_the_vehicle_s_time() -> None:
         for i in range(4):
             fleet.quaternion[0] = quat_from_euler(0.0, 0.0, 0.5 * math.pi * i)
             one = np.ones(1, np.bool_)
-            render_images(fleet, arenas, one, MOUNT, lens_of(CAMERA, 40.0), out, None)
+            render_images(fleet, arenas, one, Eye(MOUNT, lens_of(CAMERA, 40.0), out, None))
             assert np.array_equal(out[0], expected(world, fleet, 0, 40.0))
             seen.append(out.copy())
     assert np.array_equal(seen[:4], seen[8:12])
@@ -107,9 +110,9 @@ def test_depth_beyond_16_bits_is_clipped() -> None:
     arenas.bounds[0] = [-100.0, 100.0, -100.0, 100.0, 50.0, 0.0]
     fleet.position[0] = [0.0, 0.0, -20.0]
     out = np.zeros((1, 9, 9), np.uint16)
-    render_images(fleet, arenas, np.ones(1, np.bool_), Mount((10.0, 0.0, 0.0), 0.0),
-         Lens(40.0, 4.0, 4.0, 200.0), out, None)  # fmt: skip
+    eye = Eye(Mount((10.0, 0.0, 0.0), 0.0), Lens(40.0, 4.0, 4.0, 200.0), out, None)
+    render_images(fleet, arenas, np.ones(1, np.bool_), eye)
     assert np.all(out == 65_535)
-    render_images(fleet, arenas, np.ones(1, np.bool_), Mount((40.0, 0.0, 0.0), 0.0),
-         Lens(40.0, 4.0, 4.0, 200.0), out, None)  # fmt: skip
+    eye = Eye(Mount((40.0, 0.0, 0.0), 0.0), Lens(40.0, 4.0, 4.0, 200.0), out, None)
+    render_images(fleet, arenas, np.ones(1, np.bool_), eye)
     assert out[0, 4, 4] == 60_000

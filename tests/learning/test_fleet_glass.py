@@ -12,7 +12,8 @@ from airl_mav.arena.geometry import Arena, Obstacles
 from airl_mav.camera.frame import depth_to_z16
 from airl_mav.camera.render import camera_pose, render
 from airl_mav.envs.arenas import batch_of
-from airl_mav.envs.cameras import lens_of, render_images
+from airl_mav.envs.cameras import Eye, render_images
+from airl_mav.envs.colour_images import lens_of
 from airl_mav.envs.meshes import MeshesSeen
 from airl_mav.profiles.appearance import Appearance
 from airl_mav.profiles.arena import ArenaSpec
@@ -62,7 +63,7 @@ def test_depth_is_that_of_an_arena_without_the_glass(name: str) -> None:
             seen.put(i, each)
         out = np.zeros((n, CAMERA.height, CAMERA.width), np.uint16)
         who = np.ones(n, np.bool_)
-        render_images(fleet, batch_of(worlds), who, MOUNT, lens, out, seen.by_depth)
+        render_images(fleet, batch_of(worlds), who, Eye(MOUNT, lens, out, seen.by_depth))
         for i, each in enumerate(worlds):
             pose = camera_pose(fleet.position[i], fleet.quaternion[i], MOUNT)
             ours = render(each, each.centers_at(0), CAMERA, RANGE_M, *pose)

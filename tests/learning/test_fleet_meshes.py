@@ -17,8 +17,8 @@ from airl_mav.camera.picture import render_picture
 from airl_mav.camera.render import Mount, camera_pose, render
 from airl_mav.core.frames import quat_from_euler
 from airl_mav.envs.arenas import batch_of
-from airl_mav.envs.cameras import lens_of, render_images
-from airl_mav.envs.colour_images import ColourImages, Looks
+from airl_mav.envs.cameras import Eye, render_images
+from airl_mav.envs.colour_images import ColourImages, Looks, lens_of
 from airl_mav.envs.fleet import Fleet, new_fleet
 from airl_mav.envs.meshes import MeshesSeen
 from airl_mav.profiles.arena import ArenaSpec
@@ -96,7 +96,7 @@ def test_depth_is_bit_for_bit_that_of_the_rehearsal(
         fleet = scattered(n)
         out = np.zeros((n, camera.height, camera.width), np.uint16)
         lens = lens_of(camera, RANGE_M)
-        render_images(fleet, arenas, np.ones(n, np.bool_), MOUNT, lens, out, seen.batch)
+        render_images(fleet, arenas, np.ones(n, np.bool_), Eye(MOUNT, lens, out, seen.batch))
         for i, world in enumerate(worlds):
             pose = camera_pose(fleet.position[i], fleet.quaternion[i], MOUNT)
             centers = world.centers_at(0)
@@ -104,7 +104,7 @@ def test_depth_is_bit_for_bit_that_of_the_rehearsal(
                 out[i], depth_to_z16(render(world, centers, camera, RANGE_M, *pose))
             )
     boxes = np.zeros_like(out)
-    render_images(fleet, arenas, np.ones(n, np.bool_), MOUNT, lens, boxes, None)
+    render_images(fleet, arenas, np.ones(n, np.bool_), Eye(MOUNT, lens, boxes, None))
     differ = int(np.count_nonzero(boxes != out))
     assert differ > 100
     assert np.array_equal(boxes[-1], out[-1])
@@ -146,7 +146,7 @@ def test_slots_take_new_arenas_in_any_order(worlds: list[Arena]) -> None:
         fleet, arenas = scattered(2), batch_of(pair)
         out = np.zeros((2, CAMERA.height, CAMERA.width), np.uint16)
         lens = lens_of(CAMERA, RANGE_M)
-        render_images(fleet, arenas, np.ones(2, np.bool_), MOUNT, lens, out, seen.batch)
+        render_images(fleet, arenas, np.ones(2, np.bool_), Eye(MOUNT, lens, out, seen.batch))
         for i, world in enumerate(pair):
             pose = camera_pose(fleet.position[i], fleet.quaternion[i], MOUNT)
             expected = render(world, world.centers_at(0), CAMERA, RANGE_M, *pose)

@@ -17,13 +17,13 @@ from airl_mav.camera.picture import render_picture
 from airl_mav.camera.render import Mount, camera_pose, render
 from airl_mav.core.frames import quat_from_euler
 from airl_mav.envs.arenas import batch_of, put_arena, relief_of, with_room
-from airl_mav.envs.cameras import lens_of, render_images
-from airl_mav.envs.colour_images import ColourImages, Looks
+from airl_mav.envs.cameras import Eye, render_images
+from airl_mav.envs.colour_images import ColourImages, Looks, lens_of
 from airl_mav.envs.experts import Expert
 from airl_mav.envs.fleet import Fleet, Verdict, new_fleet
-from airl_mav.envs.goal_map import OVER_M, Body, map_of
 from airl_mav.envs.meshes import MeshesSeen
 from airl_mav.envs.navigation import Navigation
+from airl_mav.envs.planner import OVER_M, Body, map_of
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.policy.action_sets import commands
 from airl_mav.profiles.arena import ArenaSpec
@@ -63,7 +63,7 @@ def images(worlds: list[Arena], seen: MeshesSeen, fleet: Fleet) -> np.ndarray:
     n = len(worlds)
     out = np.zeros((n, CAMERA.height, CAMERA.width), np.uint16)
     lens = lens_of(CAMERA, RANGE_M)
-    render_images(fleet, batch_of(worlds), np.ones(n, np.bool_), MOUNT, lens, out, seen.batch)
+    render_images(fleet, batch_of(worlds), np.ones(n, np.bool_), Eye(MOUNT, lens, out, seen.batch))
     return out
 
 
@@ -90,7 +90,8 @@ def test_depth_is_bit_for_bit_that_of_the_rehearsal_in_any_order(worlds: list[Ar
             differ += int(np.count_nonzero(flat != out[i]))
     assert differ > 500
     again = MeshesSeen(2)
-    again.restore(pair)
+    for i, world in enumerate(pair):
+        again.put(i, world)
     np.testing.assert_array_equal(images(pair, again, fleet), out)
 
 

@@ -19,8 +19,8 @@ from airl_mav.envs.evaluation import (
     success_rate,
 )
 from airl_mav.envs.experts import Expert, choices
-from airl_mav.envs.goal_map import Body, map_of
 from airl_mav.envs.navigation import Navigation
+from airl_mav.envs.planner import Body, map_of
 from airl_mav.envs.sb3 import NavigationVecEnv
 from airl_mav.envs.spec import ExpertName, spec_of
 from airl_mav.envs.vector import NavigationVectorEnv

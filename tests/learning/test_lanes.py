@@ -16,10 +16,8 @@ from airl_mav.control.gains import Gains
 from airl_mav.core.constants import TICK_S, TICK_US
 from airl_mav.core.kernels import kernel
 from airl_mav.envs.arenas import ArenaBatch, batch_of
-from airl_mav.envs.fleet import Fleet, Rules, Verdict, hover, new_fleet, vehicle_of
+from airl_mav.envs.fleet import LANES, Fleet, Rules, Verdict, hover, new_fleet, vehicle_of
 from airl_mav.envs.flight import NAN3, REPEAT_US, advance
-from airl_mav.envs.lanes import LANES
-from airl_mav.envs.legs import Legs
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.conditions import Spread
 from airl_mav.profiles.loading import load_profile
@@ -136,7 +134,7 @@ def commanded(fleet: Fleet, rng: np.random.Generator, by_rates: float = 0.0) -> 
         fleet.setpoint[fleet.by_rates] = rates[fleet.by_rates]
 
 
-@pytest.mark.parametrize("n", [1, LANES, 3 * LANES + 1])
+@pytest.mark.parametrize("n", [1, len(LANES), 3 * len(LANES) + 1])
 @pytest.mark.parametrize("windy", [False, True])
 @pytest.mark.parametrize("by_rates", [0.0, 0.5, 1.0])
 def test_together_as_alone(n: int, windy: bool, by_rates: float) -> None:
@@ -170,7 +168,7 @@ def test_together_as_alone(n: int, windy: bool, by_rates: float) -> None:
 
 def test_the_motors_of_these_flights_saturate() -> None:
     """Or the flights above would not show that those are mixed alike."""
-    n = 4 * LANES
+    n = 4 * len(LANES)
     rng = np.random.default_rng(5)
     fleet, arenas = fleet_of(n, rng), arenas_of(n, "no-obstacles")
     saturated = 0
@@ -185,7 +183,7 @@ def test_the_motors_of_these_flights_saturate() -> None:
 @pytest.mark.parametrize("arena", ["static-obstacles", "dynamic-obstacles"])
 def test_neither_order_nor_company_matters(arena: str) -> None:
     """Flights to their ends, some early: in another order, and one vehicle at a time."""
-    n = 5 * LANES + 2
+    n = 5 * len(LANES) + 2
     order = np.random.default_rng(1).permutation(n)
     flown = []
     for rows in (np.arange(n), order):
@@ -215,38 +213,8 @@ def test_neither_order_nor_company_matters(arena: str) -> None:
         np.testing.assert_array_equal(together, single)
 
 
-@pytest.mark.parametrize("arena", ["no-obstacles", "dynamic-obstacles"])
-def test_legs_are_flights_one_after_the_other(arena: str) -> None:
-    """With the setpoint between them, and the pose for the camera; also where a flight ends."""
-    n = 5 * LANES + 2
-    at_once, parts = (fleet_of(n, np.random.default_rng(2)) for _ in range(2))
-    arenas, rng, ended = arenas_of(n, arena), np.random.default_rng(3), np.zeros(3, np.int64)
-    for _ in range(60):
-        setpoints = rng.uniform([0, -4, -0.3, -2], [8, 4, 0.3, 2], (n, 4))
-        ticks = rng.integers([1, 0, 0], [12, 9, 9], (n, 3))
-        flies = at_once.verdict == Verdict.FLYING
-        seen = np.zeros(n, np.int64), np.zeros((n, 3)), np.zeros((n, 4))
-        legs = Legs(ticks, setpoints, *seen)
-        advance(at_once, arenas, ticks.sum(axis=1), VEHICLE, RULES, None, legs)
-        for k in range(3):
-            before = parts.verdict.copy()
-            advance(parts, arenas, ticks[:, k].copy(), VEHICLE, RULES, None)
-            ended[k] += (parts.verdict != before).sum()
-            if k == 0:
-                parts.setpoint[flies] = setpoints[flies]
-                parts.repeat_us[flies] = parts.time_us[flies]
-            elif k == 1:
-                for name in ("time_us", "position", "quaternion"):
-                    seen = getattr(legs, f"seen_{name.removeprefix('time_')}")
-                    np.testing.assert_array_equal(seen[flies], getattr(parts, name)[flies], name)
-                assert not legs.seen_quaternion[~flies].any()
-        for together, one in zip(at_once, parts, strict=True):
-            np.testing.assert_array_equal(together, one)
-    assert (ended > 0).all()
-
-
 def test_who_has_landed_is_left_alone() -> None:
-    n = LANES + 1
+    n = len(LANES) + 1
     fleet, arenas = fleet_of(n, np.random.default_rng(3)), arenas_of(n, "no-obstacles")
     fleet.verdict[2] = Verdict.COLLISION
     before = [array[2].copy() for array in fleet]

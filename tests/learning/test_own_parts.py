@@ -19,7 +19,7 @@ import torch
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-from airl_mav.envs.rewards import Step, shaped
+from airl_mav.envs.rewards import Step, reward_of
 
 
 class Costly:
@@ -28,7 +28,7 @@ class Costly:
     price = 0.25
 
     def __call__(self, step: Step):
-        return shaped(step) - self.price * abs(step.commands[:, 0])
+        return reward_of("shaped")(step) - self.price * abs(step.commands[:, 0])
 
 
 def narrow(step: Step):

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from airl_mav.envs.fleet import Verdict
-from airl_mav.envs.navigation import Flights, Navigation
+from airl_mav.envs.fleet import Flights, Verdict
+from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.rewards import Step, costs, reward_of
 from airl_mav.envs.spec import Costs, EnvironmentSpec
 from airl_mav.envs.vector import NavigationVectorEnv
@@ -92,8 +92,9 @@ def test_failures_are_collisions_and_empty_batteries_not_timeouts() -> None:
     navigation = Navigation(spec, 5)
     navigation.begin(range(5), range(5))
     before = navigation.flights()
-    navigation.fleet.verdict[:] = [0, 1, 2, 3, 4]  # flying, success, collision, battery, timeout
-    found = rewards("shaped", before, navigation.flights(), spec.episode.hold_s)
+    # Flying, success, collision, battery, timeout.
+    now = before._replace(verdict=np.arange(5))
+    found = rewards("shaped", before, now, spec.episode.hold_s)
     assert found.round().tolist() == [0.0, 1.0, -1.0, -1.0, 0.0]
 
 

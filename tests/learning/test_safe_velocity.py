@@ -10,14 +10,22 @@ import pytest
 from numpy.typing import NDArray
 
 from airl_mav.core.errors import FieldError
-from airl_mav.envs import braking
-from airl_mav.envs.braking import Braking, braking_of, measure_braking
-from airl_mav.envs.delay import bounded, speed_bound
+from airl_mav.envs import stopping
 from airl_mav.envs.fleet import Verdict
 from airl_mav.envs.navigation import Navigation
-from airl_mav.envs.noticing import noticed_m
+from airl_mav.envs.roofline import noticed_m
 from airl_mav.envs.spec import spec_of
-from airl_mav.envs.stopping import DecisionLoop, StoppingTask, fly_into, greatest_speed
+from airl_mav.envs.stopping import (
+    Braking,
+    DecisionLoop,
+    StoppingTask,
+    bounded,
+    braking_of,
+    fly_into,
+    greatest_speed,
+    measure_braking,
+    speed_bound,
+)
 from airl_mav.envs.vector import NavigationVectorEnv
 from airl_mav.latency.source import longest_ms, parse_latency
 from airl_mav.policy.learned import load_learned
@@ -105,8 +113,8 @@ def test_it_is_measured_once_for_each_load(
     assert braking_of(QUAD) == measured
     assert carrying.distance_m != measured.distance_m
     calls: list[str] = []
-    monkeypatch.setattr(braking, "measure_braking", lambda _: calls.append("measured"))
-    braking._braking.cache_clear()  # as another process would find it
+    monkeypatch.setattr(stopping, "measure_braking", lambda _: calls.append("measured"))
+    stopping._braking.cache_clear()  # as another process would find it
     assert braking_of(heavy) == carrying
     assert not calls
 
@@ -114,16 +122,16 @@ def test_it_is_measured_once_for_each_load(
 def test_a_damaged_measurement_is_measured_again(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(braking, "cache_folder", lambda _: tmp_path)
-    braking._braking.cache_clear()
+    monkeypatch.setattr(stopping, "cache_folder", lambda _: tmp_path)
+    stopping._braking.cache_clear()
     first = braking_of(QUAD)
     (stored,) = tmp_path.glob("braking-*.json")
     held = json.loads(stored.read_text(encoding="utf-8"))
     assert held["vehicle_sha256"] == profile_digest(QUAD)
     stored.write_text(stored.read_text(encoding="utf-8").replace("8.0", "8.1"), encoding="utf-8")
-    braking._braking.cache_clear()
+    stopping._braking.cache_clear()
     assert braking_of(QUAD) == first
-    braking._braking.cache_clear()
+    stopping._braking.cache_clear()
 
 
 # --- the worst moment

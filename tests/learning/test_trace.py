@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -86,18 +86,20 @@ class TickByTick(Trace):
         super().__init__(1)
         self.recorder = TrajectoryRecorder()
         self.poses: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        self._energy_j = 0.0
 
     def begin(self, i: int, fleet: Fleet) -> None:
         super().begin(i, fleet)
         self._add(fleet, 0.0)
 
-    def advance(self, fleet: Fleet, ticks: np.ndarray, fly: Callable[[np.ndarray], None]) -> None:
-        for _ in range(int(ticks[0])):
-            if fleet.verdict[0] != Verdict.FLYING:
-                return
-            before = float(fleet.energy[0])
-            fly(np.ones(1, np.int64))
-            self._add(fleet, (float(fleet.energy[0]) - before) * US_PER_S / TICK_US)
+    def next_us(self, fleet: Fleet) -> np.ndarray:
+        return fleet.time_us + TICK_US
+
+    def sample(self, fleet: Fleet) -> None:
+        if int(fleet.time_us[0]) not in self.poses:
+            energy_j = float(fleet.energy[0])
+            self._add(fleet, (energy_j - self._energy_j) * US_PER_S / TICK_US)
+            self._energy_j = energy_j
 
     def _add(self, fleet: Fleet, power_w: float) -> None:
         state = fleet.position[0].copy(), fleet.velocity[0].copy(), fleet.quaternion[0].copy()

@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 
 from airl_mav.core.errors import UsageError
-from airl_mav.envs.delay import injections_of
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec, spec_of
+from airl_mav.envs.stopping import injections_of
 from airl_mav.training.config import TrainingConfig, configured
 
 LATE = {"computer": "ras-pi-4", "workload": "template-7x32", "link_ms": 7.0}

@@ -26,8 +26,7 @@ from airl_mav.rehearsal import lock
 from airl_mav.rehearsal.run_folder import load
 from airl_mav.training import run
 from airl_mav.training.config import TrainingConfig, check_fields
-from airl_mav.training.progress import TrainingBar
-from airl_mav.training.request import TrainRequest
+from airl_mav.training.request import TrainingBar, TrainRequest
 from airl_mav.training.run import nominal
 from airl_mav.training.store import Evaluation, TrainingFolder
 from tests.support.command_line import airl, option_words

@@ -10,13 +10,14 @@ import pytest
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.envs.arenas import batch_of
+from airl_mav.envs.decision import frame_age_us
+from airl_mav.envs.draws import Winds
 from airl_mav.envs.faults import gusts, twin_faults
 from airl_mav.envs.fleet import hover, new_fleet
 from airl_mav.envs.flight import advance
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import spec_of
 from airl_mav.envs.trace import Trace
-from airl_mav.envs.winds import Winds
 from airl_mav.experiments.gym_flier import GymFlier
 from airl_mav.faults.model import Fault
 from airl_mav.faults.twin import check_twin
@@ -28,6 +29,7 @@ from airl_mav.scenario.resolve import resolve
 from firmware_sim.faults.timeline import Acting
 from firmware_sim.faults.wind import gust_at
 from tests.learning.test_fleet import ENDLESS, OPEN, VEHICLE, PlantPilot, command
+from tests.support.blown import fly_blown
 
 FORWARD = np.array([[2.0, 0.0, 0.3]])
 PERIOD_US = 33_333
@@ -64,13 +66,12 @@ def test_twin_and_plant_fly_through_the_same_gust() -> None:
     assert winds.begin(0, 3).tolist() == [-1.0, 2.0, 0.0]
     hover(fleet, 0, 60.0, VEHICLE)
 
-    def fly(ticks: np.ndarray, air: np.ndarray | None) -> None:
-        advance(fleet, arenas, ticks, VEHICLE, ENDLESS, air)
-
     for setpoint in np.random.default_rng(1).uniform(-2, 2, (5, 4)):
         command(fleet, 0, setpoint)
         pilot.fly(setpoint, 250)
-        winds.fly(fleet, np.array([250]), fly)
+        fly_blown(
+            winds, fleet, 250, lambda n: advance(fleet, arenas, n, VEHICLE, ENDLESS, winds.air)
+        )
     assert np.abs(fleet.position[0] - pilot.plant.truth().position).max() < 1e-6
     pilot.plant.close()
 
@@ -91,12 +92,12 @@ def test_late_frames_come_in_order(words: str) -> None:
     cameras.begin(0, 5)
     failing = cameras._late[0]
     captures = int(cameras._first_us[0]) + PERIOD_US * np.arange(-60, 120)
-    arrivals = captures + cameras.transport_us + np.where(failing.at(captures), 250_000, 0)
+    arrivals = captures + cameras.times.transport_us + np.where(failing.at(captures), 250_000, 0)
     arrivals = np.maximum.accumulate(arrivals)
     ages = set()
     for now_us in range(0, 3 * US_PER_S, 7 * TICK_US):
         newest = captures[arrivals <= now_us].max()
-        (age_us,) = cameras.age_us(np.array([now_us]))
+        age_us = frame_age_us(cameras.times, 0, now_us)
         assert age_us == now_us - newest
         ages.add(age_us // 100_000)
     assert max(ages) >= 2
@@ -134,7 +135,7 @@ def test_a_stuck_camera_shows_the_first_frame_of_the_fault() -> None:
         for each, seen in ((twin, pictures), (twin_too, healthy)):
             each.fly(FORWARD)
             seen.append(each.cameras.image[0].copy())
-        times.append(int(trace._capture_us[0]))
+        times.append(int(twin._decision.seen.time_us[0]))
     stuck = [1_000_000 <= time_us < 2_500_000 for time_us in times]
     frozen = twin.cameras._frozen[0][0]
     taken_us = twin.cameras._freeze_us[0][0]

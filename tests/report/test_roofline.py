@@ -19,8 +19,7 @@ from airl_mav import RooflineRequest, roofline
 from airl_mav.cli import roofline as command
 from airl_mav.core.errors import UsageError
 from airl_mav.core.files import read_json
-from airl_mav.envs.noticing import noticed_m
-from airl_mav.envs.roofline import Roofline, RooflinePoint
+from airl_mav.envs.roofline import Roofline, RooflinePoint, noticed_m
 from airl_mav.experiments import roofline as experiment
 from airl_mav.policy.card import read_card
 from airl_mav.policy.learned import LearnedPolicy

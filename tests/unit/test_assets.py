@@ -21,7 +21,7 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import render
 from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import ned_to_enu, quat_from_euler
-from airl_mav.envs.contact import NOTHING, WALL, touches
+from airl_mav.envs.arenas import NOTHING, WALL, touches
 from airl_mav.profiles.appearance import MATERIALS
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
@@ -76,7 +76,7 @@ def off_edges(bodies: np.ndarray) -> np.ndarray:
 
 
 def touched(arena: Arena, place: tuple[float, float, float], radius_m: float) -> int:
-    """Return what a disc 0.2 m high touches, as `envs.contact.touches`."""
+    """Return what a disc 0.2 m high touches, as `envs.arenas.touches`."""
     o = arena.obstacles
     return touches(
         *(place, radius_m, HALF_HEIGHT_M, arena.bounds.as_array(), len(o)),

@@ -12,7 +12,7 @@ import pytest
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, PlacedMesh, Shape, Tour
 from airl_mav.camera.render import camera_pose
 from airl_mav.core.frames import quat_to_matrix
-from airl_mav.envs.braking import braking_of
+from airl_mav.envs.stopping import braking_of
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.quality import measure_quality
 from airl_mav.flight.record import EpisodeRecord

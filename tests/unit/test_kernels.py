@@ -16,7 +16,7 @@ import pytest
 from numba import TypingError
 from numpy.typing import NDArray
 
-from airl_mav import camera
+from airl_mav import camera, envs
 from airl_mav.camera.colour import Work
 from airl_mav.core import cache, compiling, kernels
 from tests.support.processes import run_alone
@@ -124,7 +124,8 @@ def test_no_kernel_that_borrows_arrays_returns_one() -> None:
     assert np.ndarray in parts_of(tuple[int, Work])
     borrowing = {
         each
-        for found in pkgutil.iter_modules(camera.__path__, f"{camera.__name__}.")
+        for package in (camera, envs)
+        for found in pkgutil.iter_modules(package.__path__, f"{package.__name__}.")
         for each in vars(importlib.import_module(found.name)).values()
         if getattr(each, "targetoptions", {}).get("_nrt") is False
     }

@@ -28,8 +28,7 @@ from airl_mav.camera import primitives
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.picture import render_picture
 from airl_mav.core.errors import UsageError
-from airl_mav.envs.arenas import batch_of
-from airl_mav.envs.contact import CEILING, FLOOR, NOTHING, WALL, clearance, touches
+from airl_mav.envs.arenas import CEILING, FLOOR, NOTHING, WALL, batch_of, clearance, touches
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile, profile_digest
 from airl_mav.report.camera_pictures import ROOM, coloured_segmentation

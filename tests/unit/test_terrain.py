@@ -26,8 +26,8 @@ from airl_mav.camera.picture import render_picture
 from airl_mav.camera.primitives import FLOOR, OBSTACLE, SKY
 from airl_mav.camera.render import render
 from airl_mav.core.frames import quat_from_euler
-from airl_mav.envs.contact import FLOOR as TOUCHED_FLOOR
-from airl_mav.envs.contact import NOTHING, clearance, touches
+from airl_mav.envs.arenas import FLOOR as TOUCHED_FLOOR
+from airl_mav.envs.arenas import NOTHING, clearance, touches
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.projection import Projection

@@ -11,7 +11,7 @@ import numpy as np
 
 from airl_mav.arena.geometry import Arena
 from airl_mav.core.constants import US_PER_S
-from airl_mav.envs.braking import braking_of
+from airl_mav.envs.stopping import braking_of
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory

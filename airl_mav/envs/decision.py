@@ -1,0 +1,416 @@
+"""One decision of each of n vehicles: what happens between its observation and the next one.
+
+Sequential, as in the paper: observe, infer, act, hold, and observe again. Pipelined: the next
+decision begins with the newest frame as soon as the last one is ready; nothing is held.
+
+A decision is a list of events, each at a tick that counts from the observation. `flight.advance`
+flies from one to the next, without Python. Where body rates are commanded, the flight controller
+follows another kind of setpoint only when it publishes its control mode, twice a second
+(`control.demand.KIND_US`). A companion whose decision is overdue has it end the turn, then stop
+(`companion.watchdog`): zero rates are flown at once, the velocity of zero from then on.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from airl_mav.control.demand import KIND_US
+from airl_mav.core.constants import TICK_US
+from airl_mav.core.kernels import borrowing_kernel, kernel, large_borrowing_kernel
+from airl_mav.envs.faults import BEFORE_US, later_in
+from airl_mav.envs.fleet import (
+    ATTITUDE,
+    BY_RATES,
+    POSITION,
+    RATES,
+    VELOCITY,
+    YAW_RATE,
+    Fleet,
+    Seen,
+    State,
+    Verdict,
+)
+from airl_mav.policy.actions import ALTITUDE_P, MAX_VERTICAL_M_S
+
+RATES_FOLLOWED_US = KIND_US - 100_000
+"""Body rates are followed so long after a flight has begun at the earliest: until then the flight
+controller flies the velocity with which the companion has switched to offboard, a tenth of a second
+before (`companion.mavsdk_link.OFFBOARD_SETTLE_S`) [µs]."""
+
+NEVER_US: Final = 10**12
+"""Later than any flight ends [µs]."""
+
+_SEND: Final = 0  # the setpoint leaves the companion
+_STOP: Final = 1  # a stop arrives: the last setpoint has expired
+_ACCEPT: Final = 2  # the setpoint arrives
+_CAPTURE: Final = 3  # the frame of the next observation is taken
+_END: Final = 4  # the next decision begins
+_ARRIVE: Final = 5  # a setpoint of an earlier decision arrives; the numbers behind it, older ones
+_MOST: Final = 6  # events of a decision, beside those of earlier setpoints
+
+_FLYING: Final = int(Verdict.FLYING)
+
+
+class FrameTimes(NamedTuple):
+    """Frames come at a camera's rate; their phase to the decisions is each episode's own."""
+
+    first_us: NDArray[np.int64]
+    """(n,) when the first frame of each episode was taken [µs]."""
+    period_us: int
+    transport_us: int
+    """From capture to decoded [µs]."""
+    late: NDArray[np.int64]
+    """(k, 3) `faults.delays_of` the camera."""
+
+
+class Timing(NamedTuple):
+    """Times of every decision of an environment."""
+
+    pipelined: bool
+    link_us: int
+    """Setpoint sent to accepted [µs]."""
+    hold_us: int
+    """Sequential: how long an action is held before the next observation [µs]."""
+    hover_us: int
+    """Sequential: the velocity is zeroed so long after the observation [µs]; negative = never."""
+    timeout: int
+    """Body rates: ticks from one setpoint to the stop that replaces it; negative = velocities."""
+    altitude_m: float
+    """Height that is held where actions command no vertical speed [m]."""
+    uplink: NDArray[np.int64]
+    """(k, 3) `faults.delays_of` the uplink."""
+    frames: FrameTimes
+
+
+class Decision(NamedTuple):
+    """The present decision of n vehicles; rows are updated in place."""
+
+    timing: Timing
+    errors: NDArray[np.float64]  # (n, 9) of telemetry
+    began_us: NDArray[np.int64]  # (n,) time of the observation
+    t2_us: NDArray[np.int64]  # (n,) inference
+    before_m: NDArray[np.float64]  # (n,) distance to the goal at the observation
+    flying: NDArray[np.bool_]  # (n,) the flight had not ended then
+    setpoint: NDArray[np.float64]  # (n, 4) as `Fleet.setpoint`
+    tick: NDArray[np.int64]  # (n, k) when events happen, from `began_us` on
+    kind: NDArray[np.int64]  # (n, k)
+    events: NDArray[np.int64]  # (n,) number of events
+    next: NDArray[np.int64]  # (n,) the next one
+    age: NDArray[np.int64]  # (n,) of the next observation's frame, in ticks
+    pause_us: NDArray[np.int64]  # (n,) when Python is needed
+    seen: Seen
+    accepted: NDArray[np.int64]  # (n,) tick
+    left: NDArray[np.int64]  # (n, k) ticks until earlier setpoints arrive, newest first; 0: none
+    in_flight: NDArray[np.float64]  # (n, k, 4) those setpoints
+    newest: NDArray[np.float64]  # (n, 4) the newest body rates and thrust
+    wanted: NDArray[np.bool_]  # (n,) whether they are newer than a velocity of zero
+    sent_us: NDArray[np.int64]  # (n,) when the last one was sent; 0: none
+
+
+def new_decision(timing: Timing, errors: NDArray[np.float64]) -> Decision:
+    """Return room for the decisions of n vehicles with such errors (n, 9) of telemetry."""
+    # A pipelined decision lasts a tick at least.
+    n, room = len(errors), max(-(-timing.link_us // TICK_US), 1)
+
+    def whole(*shape: int) -> NDArray[np.int64]:
+        return np.zeros((n, *shape), np.int64)
+
+    seen = Seen(whole(), *(np.zeros((n, size)) for size in (3, 4, 3, 3)))
+    return Decision(
+        timing=timing,
+        errors=errors,
+        began_us=whole(),
+        t2_us=whole(),
+        before_m=np.zeros(n),
+        flying=np.zeros(n, np.bool_),
+        setpoint=np.zeros((n, 4)),
+        tick=whole(room + _MOST),
+        kind=whole(room + _MOST),
+        events=whole(),
+        next=whole(),
+        age=whole(),
+        pause_us=np.full(n, NEVER_US),
+        seen=seen,
+        accepted=whole(),
+        left=whole(room),
+        in_flight=np.zeros((n, room, 4)),
+        newest=np.zeros((n, 4)),
+        wanted=np.zeros(n, np.bool_),
+        sent_us=whole(),
+    )
+
+
+def begin_decision(decision: Decision, i: int) -> None:
+    """Begin the flight of vehicle i: nothing is in flight when a decision begins."""
+    decision.left[i] = 0
+    decision.newest[i], decision.wanted[i], decision.sent_us[i] = 0.0, False, 0
+
+
+@large_borrowing_kernel
+def plan(decision: Decision, fleet: Fleet) -> None:
+    """Write down the events of all decisions, whose setpoints and inference times are there."""
+    for i in range(len(decision.t2_us)):
+        decision.began_us[i] = fleet.time_us[i]
+        decision.flying[i] = fleet.verdict[i] == _FLYING
+        decision.events[i] = decision.next[i] = 0
+        if decision.timing.pipelined:
+            _plan_pipelined(decision, fleet.time_us[i], i, decision.t2_us[i])
+        else:
+            _plan_sequential(decision, fleet.time_us[i], i, decision.t2_us[i])
+
+
+@borrowing_kernel
+def _add(decision: Decision, i: int, tick: int, kind: int) -> None:
+    """Insert an event of vehicle i behind all that happen no later."""
+    at = decision.events[i]
+    ticks, kinds = decision.tick[i], decision.kind[i]
+    while at > 0 and ticks[at - 1] > tick:
+        ticks[at], kinds[at] = ticks[at - 1], kinds[at - 1]
+        at -= 1
+    ticks[at], kinds[at] = tick, kind
+    decision.events[i] += 1
+
+
+@borrowing_kernel
+def _plan_sequential(decision: Decision, now_us: int, i: int, t2_us: int) -> None:
+    timing = decision.timing
+    arrives_us = t2_us + timing.link_us + later_in(timing.uplink, now_us + t2_us)
+    sent, accepted = ticks_of(t2_us), ticks_of(arrives_us)
+    stop_us = NEVER_US if timing.hover_us < 0 else timing.hover_us
+    if timing.timeout >= 0:
+        overdue = _overdue(decision, i, now_us)
+        # What is replaced in time never expires, though the next is on its way.
+        if overdue < sent:
+            stop_us = min(stop_us, overdue * TICK_US)
+        decision.sent_us[i] = now_us + TICK_US * sent
+    # The stop takes as long to arrive as any setpoint.
+    stop = ticks_of(stop_us + timing.link_us + later_in(timing.uplink, now_us + stop_us))
+    _add(decision, i, sent, _SEND)
+    if 0 <= stop < accepted:
+        # A stop is there before the setpoint is sent, or right behind.
+        _add(decision, i, stop, _STOP)
+    ended = sent + timing.hold_us // TICK_US
+    _add(decision, i, accepted, _ACCEPT)
+    # Its tick is known once the setpoint is there.
+    _add(decision, i, ended, _CAPTURE)
+    _add(decision, i, ended, _END)
+    decision.accepted[i] = accepted
+
+
+@borrowing_kernel
+def _plan_pipelined(decision: Decision, now_us: int, i: int, t2_us: int) -> None:
+    timing = decision.timing
+    sent, accepted = ticks_of(t2_us), ticks_of(t2_us + timing.link_us)
+    # Up, or the frame would not be there yet.
+    frame = -((now_us - decoded_after_us(timing.frames, i, now_us)) // TICK_US)
+    ended = max(sent, frame)
+    age = min(ticks_of(frame_age_us(timing.frames, i, now_us + ended * TICK_US)), ended)
+    decision.age[i], decision.accepted[i] = age, accepted
+    # The oldest in flight is the first to arrive.
+    for k in range(decision.left.shape[1] - 1, -1, -1):
+        if 0 < decision.left[i, k] <= ended:
+            _add(decision, i, decision.left[i, k], _ARRIVE + k)
+    _add(decision, i, ended - age, _CAPTURE)
+    _add(decision, i, sent, _SEND)
+    if accepted <= ended:
+        _add(decision, i, accepted, _ACCEPT)
+    if timing.timeout >= 0:
+        # A stop takes as long as any setpoint, but is there before the next, and by the end of the
+        # decision.
+        overdue, link = _overdue(decision, i, now_us), timing.link_us // TICK_US
+        again = sent + timing.timeout
+        if 0 <= overdue < sent:
+            _add(decision, i, min(overdue + link, ended), _STOP)
+        if again < ended:
+            _add(decision, i, min(again + link, ended), _STOP)
+        decision.sent_us[i] = now_us + TICK_US * sent
+    _add(decision, i, ended, _END)
+
+
+@borrowing_kernel
+def _overdue(decision: Decision, i: int, now_us: int) -> int:
+    """Return in how many ticks a companion stops that sends nothing; below 0: it has."""
+    overdue: int = (decision.sent_us[i] - now_us) // TICK_US + decision.timing.timeout
+    return overdue
+
+
+@borrowing_kernel
+def next_stretch(decision: Decision, fleet: Fleet, i: int, state: State, j: int) -> int:
+    """Carry out what is due of the decision of vehicle i, which is in lane j.
+
+    Of a flight that is over everything is due. Time and verdict of `fleet` are those of now.
+
+    Returns:
+        Ticks until something is due; 0: the decision is over, or Python is needed.
+    """
+    over = fleet.verdict[i] != _FLYING
+    now = (fleet.time_us[i] - decision.began_us[i]) // TICK_US
+    while decision.next[i] < decision.events[i] and (
+        over or decision.tick[i, decision.next[i]] <= now
+    ):
+        event = decision.next[i]
+        decision.next[i] += 1
+        _carry_out(decision, fleet, i, state, j, event)
+    if over or decision.next[i] == decision.events[i]:
+        return 0
+    until: int = min(
+        decision.tick[i, decision.next[i]] - now,
+        (decision.pause_us[i] - fleet.time_us[i]) // TICK_US,
+    )
+    if decision.timing.timeout >= 0 and decision.wanted[i] != fleet.by_rates[i] and until > 0:
+        published = _until_published(fleet.time_us[i])
+        if published == 0:
+            fleet.by_rates[i] = decision.wanted[i]
+            state[BY_RATES, j] = fleet.by_rates[i]
+            _follow(decision, fleet, i, state, j)
+        else:
+            until = min(until, published)
+    return max(until, 0)
+
+
+@kernel
+def _until_published(time_us: int) -> int:
+    """Return in how many ticks the flight controller publishes its control mode."""
+    first, period = (RATES_FOLLOWED_US - time_us) // TICK_US, KIND_US // TICK_US
+    return first if first >= 0 else first % period
+
+
+@borrowing_kernel
+def _carry_out(decision: Decision, fleet: Fleet, i: int, state: State, j: int, event: int) -> None:
+    """Let an event of vehicle i happen; arguments as of `next_stretch`."""
+    timing = decision.timing
+    kind = decision.kind[i, event]
+    if kind == _SEND:
+        if math.isnan(decision.setpoint[i, 2]):
+            error_m = -timing.altitude_m - (state[POSITION + 2, j] + decision.errors[i, 2])
+            down = min(max(ALTITUDE_P * error_m, -MAX_VERTICAL_M_S), MAX_VERTICAL_M_S)
+            decision.setpoint[i, 2] = down
+    elif kind == _STOP:
+        expire(decision, fleet, i, state, j)
+    elif kind == _CAPTURE:
+        _look(decision.seen, fleet.time_us[i], i, state, j)
+    elif kind == _END:
+        _keep_in_flight(decision, i, decision.tick[i, event])
+    elif kind == _ACCEPT:
+        take(decision, fleet, decision.setpoint[i], i, state, j)
+        if not timing.pipelined:
+            # The frame and the end of the decision come next.
+            left = decision.tick[i, event + 2] - decision.tick[i, event]
+            then_us = fleet.time_us[i] + left * TICK_US
+            decision.age[i] = min(ticks_of(frame_age_us(timing.frames, i, then_us)), left)
+            decision.tick[i, event + 1] = decision.tick[i, event + 2] - decision.age[i]
+    else:
+        take(decision, fleet, decision.in_flight[i, kind - _ARRIVE], i, state, j)
+
+
+@borrowing_kernel
+def take(
+    decision: Decision, fleet: Fleet, setpoint: NDArray[np.float64], i: int, state: State, j: int
+) -> None:
+    """Give vehicle i a setpoint (4,); arguments as of `next_stretch`."""
+    if decision.timing.timeout >= 0:
+        for axis in range(4):
+            decision.newest[i, axis] = setpoint[axis]
+        decision.wanted[i] = True
+        if fleet.by_rates[i]:
+            _follow(decision, fleet, i, state, j)
+        return
+    for axis in range(4):
+        fleet.setpoint[i, axis] = setpoint[axis]
+    # It is turned into NED in the next tick.
+    state[YAW_RATE, j], fleet.repeat_us[i] = setpoint[3], fleet.time_us[i]
+
+
+@borrowing_kernel
+def expire(decision: Decision, fleet: Fleet, i: int, state: State, j: int) -> None:
+    """Have vehicle i stop; of body rates, end the turn. Arguments as of `next_stretch`."""
+    if decision.timing.timeout >= 0:
+        for axis in range(3):
+            decision.newest[i, axis] = 0.0
+        decision.wanted[i] = False
+        if fleet.by_rates[i]:
+            _follow(decision, fleet, i, state, j)
+        return
+    for axis in range(4):
+        fleet.setpoint[i, axis] = 0.0
+    state[YAW_RATE, j], fleet.repeat_us[i] = 0.0, fleet.time_us[i]
+
+
+@borrowing_kernel
+def _follow(decision: Decision, fleet: Fleet, i: int, state: State, j: int) -> None:
+    """Have vehicle i fly the newest setpoint of the kind that it follows."""
+    for axis in range(4):
+        fleet.setpoint[i, axis] = decision.newest[i, axis] if fleet.by_rates[i] else 0.0
+    state[YAW_RATE, j], fleet.repeat_us[i] = fleet.setpoint[i, 3], fleet.time_us[i]
+
+
+@borrowing_kernel
+def _look(seen: Seen, now_us: int, i: int, state: State, j: int) -> None:
+    """Note where vehicle i, in lane j, takes its frame."""
+    seen.time_us[i] = now_us
+    for axis in range(3):
+        seen.position[i, axis] = state[POSITION + axis, j]
+        seen.velocity[i, axis] = state[VELOCITY + axis, j]
+        seen.omega[i, axis] = state[RATES + axis, j]
+    for axis in range(4):
+        seen.quaternion[i, axis] = state[ATTITUDE + axis, j]
+
+
+@borrowing_kernel
+def _keep_in_flight(decision: Decision, i: int, ended: int) -> None:
+    """Keep the setpoints of vehicle i that have not arrived when its decision ends at a tick."""
+    left, in_flight = decision.left[i], decision.in_flight[i]
+    for k in range(len(left) - 1, -1, -1):
+        left[k] = max((left[k - 1] if k > 0 else decision.accepted[i]) - ended, 0)
+        for axis in range(4):
+            in_flight[k, axis] = in_flight[k - 1, axis] if k > 0 else decision.setpoint[i, axis]
+
+
+@kernel
+def ticks_of(time_us: int) -> int:
+    """Round a time [µs] to whole ticks."""
+    return (time_us + TICK_US // 2) // TICK_US
+
+
+@kernel
+def frame_age_us(times: FrameTimes, i: int, time_us: int) -> int:
+    """Return how old the newest decoded frame of vehicle i is at a time [µs] of its episode."""
+    since_us = time_us - times.transport_us - times.first_us[i]
+    age: int = times.transport_us + since_us % times.period_us
+    for k in range(len(times.late)):
+        age = _delayed(times, i, time_us, age, k)
+    return age
+
+
+@kernel
+def _delayed(times: FrameTimes, i: int, time_us: int, age_us: int, k: int) -> int:
+    """Return the age of the newest frame where fault k delays those of a time, all in order."""
+    from_us, to_us, delay_us = times.late[k, 0], times.late[k, 1], times.late[k, 2]
+    healthy = time_us - age_us
+    # A frame of after the fault waits for the last one of it.
+    last = _newest(times, i, to_us - 1)
+    if healthy < from_us or time_us - times.transport_us >= last + delay_us:
+        return age_us
+    arrived = _newest(times, i, time_us - times.transport_us - delay_us)
+    if from_us != BEFORE_US:
+        arrived = max(arrived, _newest(times, i, from_us - 1))
+    return time_us - arrived
+
+
+@kernel
+def _newest(times: FrameTimes, i: int, time_us: int) -> int:
+    """Return when the newest frame of a time [µs] was taken."""
+    newest: int = time_us - (time_us - times.first_us[i]) % times.period_us
+    return newest
+
+
+@kernel
+def decoded_after_us(times: FrameTimes, i: int, time_us: int) -> int:
+    """Return when the next frame of vehicle i is decoded after a time [µs] of its episode."""
+    since_us = (time_us - times.transport_us - times.first_us[i]) % times.period_us
+    decoded: int = time_us - since_us + times.period_us
+    return decoded

@@ -1,0 +1,220 @@
+"""The flights of n vehicles as one argument: one compiled call flies a decision of all.
+
+Numba unpacks every array of every argument at each call, which takes longer than a vehicle's
+decision. A `World` holds them, unpacked once.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import types
+from numba.experimental import structref
+from numpy.typing import NDArray
+
+from airl_mav.core.constants import TICK_US, US_PER_S
+from airl_mav.core.kernels import borrowing_kernel, kernel
+from airl_mav.envs.arenas import ArenaBatch
+from airl_mav.envs.cameras import Eye, render_images
+from airl_mav.envs.decision import Decision, plan
+from airl_mav.envs.draws import BLOCK
+from airl_mav.envs.encoding import EncodedBody, encode_body
+from airl_mav.envs.estimation import Drift, step_error
+from airl_mav.envs.fleet import Fleet, Lanes, Rules, Seen, Vehicle, Verdict
+from airl_mav.envs.flight import fly
+from airl_mav.envs.rewards import pay
+from airl_mav.policy.images import Bytes
+
+GOES_ON, TERMINATED, TRUNCATED = 0, 1, 2
+"""How a decision has ended a flight; a flight that had ended before goes on as it is."""
+
+_FLYING, _TIMEOUT = int(Verdict.FLYING), int(Verdict.TIMEOUT)
+
+
+@structref.register
+class _WorldType(types.StructRef):  # type: ignore[misc]
+    """Numba's type of a `World`; it depends on the types of the parts."""
+
+
+class World(structref.StructRefProxy):  # type: ignore[misc]
+    """What a decision of n vehicles needs; arrays are those of its parts, not copies."""
+
+    fleet: Fleet
+    arenas: ArenaBatch
+    vehicle: Vehicle
+    rules: Rules
+    decision: Decision
+    t2_us: NDArray[np.int64]
+    """(n, BLOCK) `DelayDraws.block`."""
+    extra_us: NDArray[np.int64]
+    """(n,) added to it."""
+    number: NDArray[np.int64]
+    """(n,) of the present decisions in their episodes."""
+    air: NDArray[np.float64]
+    drift: Drift | None
+    eye: Eye | None
+    """None: Python takes the images."""
+    encoding: Bytes | None
+    """None: Python makes what networks see."""
+    reward: int
+    """As of `rewards.pay`."""
+    hold_s: float
+    lanes: Lanes
+
+    def __new__(cls, *parts: Any) -> World:  # noqa: D102
+        made: World = _made(*parts)
+        return made
+
+
+structref.define_boxing(_WorldType, World)
+structref.define_constructor(World, _WorldType, list(World.__annotations__))
+
+
+@kernel
+def _made(*parts: Any) -> Any:
+    return World(*parts)
+
+
+@kernel
+def decide(
+    world: World,
+    commands: NDArray[np.float64],
+    resumed: bool,
+    numbers: NDArray[np.float64],
+    whole: NDArray[np.int64],
+    seen: EncodedBody,
+) -> int:
+    """Fly one decision of every vehicle, take the frames of the next one, and encode them.
+
+    Args:
+        world: The vehicles.
+        commands: (n, 3) or (n, 4) as of `Navigation.fly`.
+        resumed: The decisions have begun; Python has done what it was needed for.
+        numbers: (7, n) written: the numbers of `Flights` in their order, and the rewards.
+        whole: (3, n) written: verdict, what is touched, and how the decision has ended the flight.
+        seen: Written where networks see so, and there is room.
+
+    Returns:
+        How many decisions wait for Python; the frames are taken once none does.
+    """
+    # Once: each time numba counts the holders of all arrays. It does not in the loops.
+    w, decision, fleet, goal = world, world.decision, world.fleet, world.arenas.goal
+    if not resumed:
+        _begin(decision, fleet, goal, commands, w.t2_us, w.number, w.extra_us)
+        plan(decision, fleet)
+    todo = (decision.next < decision.events).astype(np.int64)
+    going = todo.copy()
+    fly(fleet, w.arenas, todo, w.vehicle, w.rules, w.air, decision, w.lanes)
+    waiting = _end(decision, fleet, w.drift, w.number, going)
+    if waiting == 0:
+        _look(decision.seen, w.arenas, w.eye)
+        status(fleet, goal, numbers, whole)
+        _judge(decision, commands, numbers, whole, w.reward, w.hold_s)
+        if len(seen.depth) > 0:
+            _encode(world, world.eye, world.encoding, seen)
+    return waiting
+
+
+@borrowing_kernel
+def _begin(
+    decision: Decision,
+    fleet: Fleet,
+    goal: NDArray[np.float64],
+    commands: NDArray[np.float64],
+    t2_us: NDArray[np.int64],
+    number: NDArray[np.int64],
+    extra_us: NDArray[np.int64],
+) -> None:
+    """Take commands as setpoints, and draws as latencies; arguments as of `World` and `decide`."""
+    for i in range(len(commands)):
+        decision.t2_us[i] = t2_us[i, number[i] % BLOCK] + extra_us[i]
+        decision.before_m[i] = goal_distance(fleet, goal, i)
+        setpoint, command = decision.setpoint[i], commands[i]
+        if decision.timing.timeout >= 0:
+            for axis in range(4):
+                setpoint[axis] = command[axis]
+            continue
+        setpoint[0], setpoint[1], setpoint[3] = command[0], command[1], command[2]
+        # NaN: decided when it is sent.
+        setpoint[2] = command[3] if len(command) == 4 else math.nan
+
+
+@borrowing_kernel
+def _end(
+    decision: Decision,
+    fleet: Fleet,
+    drift: Drift | None,
+    number: NDArray[np.int64],
+    going: NDArray[np.int64],
+) -> int:
+    """Count the decisions that are over, of those that were `going`; return how many go on."""
+    waiting = 0
+    for i in range(len(going)):
+        if decision.next[i] < decision.events[i]:
+            waiting += 1
+        elif going[i] > 0:
+            number[i] += 1
+            ticks = (fleet.time_us[i] - decision.began_us[i]) // TICK_US
+            if drift is not None:
+                step_error(drift, decision.errors, i, number[i], ticks)
+    return waiting
+
+
+@kernel
+def _look(seen: Seen, arenas: ArenaBatch, eye: Eye | None) -> None:
+    if eye is not None:
+        render_images(seen, arenas, np.ones(len(seen.time_us), np.bool_), eye)
+
+
+@kernel
+def _encode(world: World, eye: Eye | None, encoding: Bytes | None, seen: EncodedBody) -> None:
+    if eye is not None and encoding is not None:
+        errors, goal = world.decision.errors, world.arenas.goal
+        encode_body(world.fleet, errors, eye.image, goal, encoding, seen)
+
+
+@borrowing_kernel
+def _judge(
+    decision: Decision,
+    commands: NDArray[np.float64],
+    numbers: NDArray[np.float64],
+    whole: NDArray[np.int64],
+    reward: int,
+    hold_s: float,
+) -> None:
+    """Write rewards, and which flights have just ended; arguments as of `World` and `decide`."""
+    for i in range(len(commands)):
+        verdict, command = whole[0, i], commands[i]
+        ended = decision.flying[i] and verdict != _FLYING
+        whole[2, i] = (TRUNCATED if verdict == _TIMEOUT else TERMINATED) if ended else GOES_ON
+        turned = command[2] * command[2]
+        if decision.timing.timeout >= 0:
+            turned = command[0] * command[0] + command[1] * command[1] + turned
+        passed_s = numbers[0, i] - decision.began_us[i] / US_PER_S
+        before_m, now_m, speed_m_s = decision.before_m[i], numbers[3, i], numbers[4, i]
+        numbers[6, i] = pay(reward, verdict, before_m, now_m, passed_s, speed_m_s, turned, hold_s)
+
+
+@borrowing_kernel
+def goal_distance(fleet: Fleet, goal: NDArray[np.float64], i: int) -> float:
+    """Return the distance of vehicle i to its goal [m]; level, where the goal has no height."""
+    p = fleet.position[i]
+    away, below = math.hypot(goal[i, 0] - p[0], goal[i, 1] - p[1]), goal[i, 2] - p[2]
+    return away if math.isnan(below) else math.hypot(away, below)
+
+
+@borrowing_kernel
+def status(
+    fleet: Fleet, goal: NDArray[np.float64], numbers: NDArray[np.float64], whole: NDArray[np.int64]
+) -> None:
+    """Write the status of all flights; see `decide`."""
+    for i in range(len(goal)):
+        v = fleet.velocity[i]
+        numbers[0, i] = fleet.time_us[i] / US_PER_S
+        numbers[1, i], numbers[2, i] = fleet.distance[i], fleet.energy[i]
+        numbers[3, i] = goal_distance(fleet, goal, i)
+        numbers[4, i] = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+        numbers[5, i] = fleet.battery[i]
+        whole[0, i], whole[1, i] = fleet.verdict[i], fleet.touched[i]
