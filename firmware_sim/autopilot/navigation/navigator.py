@@ -1,4 +1,4 @@
-"""Runs what leads the vehicle besides the modes themselves: PX4's navigator, at its 20 Hz."""
+"""PX4's navigator: missions, geofence and the way home, at 20 Hz while it leads the vehicle."""
 
 from __future__ import annotations
 
@@ -31,6 +31,11 @@ from firmware_sim.autopilot.navigation.way_home import (
     onwards,
 )
 from firmware_sim.autopilot.requests import Place, Reposition, Request
+
+IDLE_US = 100_000
+"""Period in modes that it does not lead: what it reports then is read at 10 Hz."""
+
+_LED = (Mode.MISSION, Mode.RETURN)
 
 _WARN = 1
 """GF_ACTION: up to here the fence is told of, and not kept."""
@@ -171,7 +176,7 @@ class Navigator:
         self, situation: Situation, mode: Mode, place: Callable[[], Geodetic], *, armed: bool
     ) -> None:
         """Advance by a period; `place` is where the vehicle is, for the geofence."""
-        self.due_us = situation.time_us + PERIOD_US
+        self.due_us = situation.time_us + (PERIOD_US if mode in _LED else IDLE_US)
         self._position = situation.position
         self.fence.step(situation, mode, place)
         flying = armed and mode is Mode.MISSION
