@@ -133,10 +133,10 @@ class FlightRecorder:
         if slipped_us:
             self._slips.append((began_us, slipped_us))
 
-    def before_controls(self) -> None:
-        """Note that the flight controller is about to take a sample."""
+    def before_controls(self, ticks: int = 0) -> None:
+        """Note that the flight controller takes what was accepted, after so many further ticks."""
         if self._internals is not None and self.setpoints.fresh:
-            self.setpoints.take(self._internals.ticks_to_motors)
+            self.setpoints.take(self._internals.ticks_to_motors + ticks)
 
     def flown(self, truths: Record, flown: Record, first_us: int) -> None:
         """Take the newest ticks.

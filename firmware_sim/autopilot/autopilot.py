@@ -187,6 +187,8 @@ class BuiltinAutopilot:
         if sample is None:
             return
         time_us = sample.time_us
+        if not self.record["aligned"].item(0):
+            self.estimator.align()
         if self.flight.phase is _AIR and self._guidance.is_done(self._state):
             self._commander.handle(Event.MODE_DONE)
         if self._home.place is None and self.estimator.origin is not None:
@@ -197,12 +199,13 @@ class BuiltinAutopilot:
         readiness = READINESS[self.flight.phase][self.estimator.healthy]
         if readiness is not None:
             self._commander.handle(readiness)
-        if time_us >= supervisor.next_us:
+        looks = time_us >= supervisor.next_us
+        if looks:
             self._commander.look()
         due = self._auto_disarm.event(self.flight, time_us, idle=self._demand is None)
         if due is not None:
             self._commander.handle(due)
-        if time_us >= self._navigator.due_us:
+        if looks or time_us >= self._navigator.due_us:
             self._navigate()
         if self._manual_control.was_heard:
             self._guidance.context.sticks = self._manual_control.sticks(time_us)
@@ -261,6 +264,8 @@ class BuiltinAutopilot:
         """
         before = self.flight
         self.estimator.flown()
+        if not self.record["aligned"].item(0):
+            self._due_us = 0
         self._heard(sample)
         if self.record["detected"][0]:
             self._commander.handle(Event.LANDED if self.flight.phase is _AIR else Event.LIFTED)

@@ -124,7 +124,7 @@ class MavlinkServer:
             **BUILDERS,
             "SYSTEM_TIME": system_time(boot_unix_us),
             **self._streams.builders,
-            "TIMESYNC": peers.timesync_request,
+            "TIMESYNC": None,
         }
         self._forwarder = Forwarder(self._all)
         self._traffic = TrafficLog(lambda: self._now_us)

@@ -203,6 +203,8 @@ class CameraServer:
     Publishing does not block: a slow or stopped companion cannot hold the simulator.
     """
 
+    awaited = True
+
     def __init__(
         self, endpoint: str, context: zmq.Context[zmq.Socket[bytes]] | None = None
     ) -> None:
