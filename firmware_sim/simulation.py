@@ -44,6 +44,10 @@ MOST_TICKS = 25
 """Ticks that are flown at a time, at most: streams at 10 Hz and below are sent in between."""
 
 
+_ENDS = (COLLIDED, ALIGN)
+"""Events that end a stretch whatever follows from them."""
+
+
 @dataclass(frozen=True)
 class EpisodeSetup:
     """What an episode is made of."""
@@ -232,39 +236,37 @@ class Simulation:
     ) -> int:
         """Fly compiled ticks; return how many."""
         autopilot.take(self._sample)
-        plant, done = self.plant, 0
-        most = max(1, math.ceil(min((until_us - self.time_us) / TICK_US, MOST_TICKS)))
+        plant, done, time_us = self.plant, 0, self.time_us
+        most = max(1, math.ceil(min((until_us - time_us) / TICK_US, MOST_TICKS)))
+        arrives_us = math.inf if arrivals is None else arrivals.next_us
         while done < most:
-            if done and arrivals is not None and arrivals.next_us <= plant.time_us:
-                arrivals.arrive(plant.time_us)
+            if done and arrivals is not None and arrives_us <= time_us:
+                arrivals.arrive(time_us)
+                arrives_us = arrivals.next_us
                 if self.recorder is not None:
                     self.recorder.before_controls(done)
-            due_us: float = autopilot.decide_if_due()
-            if arrivals is not None:
-                due_us = min(due_us, arrivals.next_us)
-            ticks = max(1, math.ceil(min((due_us - plant.time_us) / TICK_US, most - done)))
+            due_us = min(autopilot.decide_if_due(), arrives_us)
+            ticks = max(1, math.ceil(min((due_us - time_us) / TICK_US, most - done)))
             flown, event = self._glide(autopilot, done, done + ticks)
             done += flown
-            self._sample = plant.newest()
-            changed = autopilot.flown(self._sample)
+            time_us += flown * TICK_US
+            changed = autopilot.flown(plant.newest)
             # After what Python fuses, other aids may be in use.
-            if changed or event in (COLLIDED, ALIGN) or not autopilot.compiled:
+            if changed or event in _ENDS or (event == FUSE and not autopilot.compiled):
                 break
+        self._sample = autopilot.sample or self._sample
         return done
 
     def _glide(self, autopilot: BuiltinAutopilot, first: int, end: int) -> tuple[int, int]:
         """Fly ticks at a constant demand into the logs; return how many, and the last event."""
-        plant, record, done, event = self.plant, autopilot.record, first, FUSE
-        while event == FUSE and done < end:
-            flown, event = plant.glide(
-                record, end - done, self._truths[done:end], self._flown[done:end]
-            )
-            done += flown
-            if event == FUSE:
-                done += 1
-                if autopilot.fuse(plant.newest(), record["left"].item(0)) or record["detected"][0]:
-                    break
-        return done - first, event
+        plant, record = self.plant, autopilot.record
+        flown, event = plant.glide(
+            record, end - first, self._truths[first:end], self._flown[first:end]
+        )
+        if event == FUSE:
+            flown += 1
+            autopilot.fuse(plant.newest(), record["left"].item(0))
+        return flown, event
 
     @property
     def next_frame_us(self) -> float:
@@ -281,7 +283,7 @@ class Simulation:
             time_us, row = self.time_us, self.plant.motion
             if time_us > until_us:
                 k = truths["time_us"].searchsorted(camera.next_us)
-                time_us, row = truths["time_us"].item(k), truths["motion"][k]
+                time_us, row = truths["time_us"].item(k), truths["motion"][k].copy()
                 if time_us > until_us:
                     break
             motion = Motion(row[POSITION], row[QUATERNION], row[VELOCITY], row[RATES])

@@ -149,8 +149,6 @@ class Estimator:
         """What tells how the ground moves below; None before the first flow."""
         self.is_changed = True
         """Whether Python has changed what compiled ticks need to know: `prepare` them."""
-        self._field: Vector | None = None
-        """The newest that the compass has measured (3,) FRD [gauss]; before alignment the mean."""
 
     @property
     def healthy(self) -> bool:
@@ -229,7 +227,6 @@ class Estimator:
         if sample.pressure_hpa is not None:
             self._fuse_baro(sample.pressure_hpa)
         if sample.mag is not None:
-            self._field = sample.mag
             self._fuse_heading(sample.mag)
 
     def _settle(self) -> None:
@@ -276,18 +273,17 @@ class Estimator:
         suspect = moving.velocity_deviates or recovery.emergency.is_doubted(self._time_us)
         self.record["gps"] = OFF if not self._uses_gps else SUSPECT if suspect else TRUSTED
 
-    def fuse_rest(self, sample: SensorSample) -> bool:
-        """Fuse what a compiled tick leaves to Python; return whether the health has changed."""
+    def fuse_rest(self, sample: SensorSample) -> None:
+        """Fuse what a compiled tick leaves to Python."""
         self._time_us, self._estimate = sample.time_us, None
         self._fuse_slower(sample)
         self._suspect()
-        return bool(settle_record(self.record))
+        settle_record(self.record)
 
-    def flown(self) -> None:
-        """Take note that compiled ticks have moved the estimate, or wait for alignment."""
+    def flown(self) -> int:
+        """Take note that compiled ticks have moved the estimate; return their time [µs]."""
         self._time_us, self._estimate = self.record["time_us"].item(0), None
-        if self.aligned:
-            self._field = self.record["mag"][0]
+        return self._time_us
 
     def see(self, odometry: Odometry) -> None:
         """Take what something else has estimated, now."""
@@ -431,9 +427,10 @@ class Estimator:
     @property
     def field_disturbed(self) -> bool:
         """Whether the compass measures something else than the earth's field, by EKF2_MAG_CHECK."""
-        if self._field is None:
+        field = self.record["mag"][0] if self.aligned else self._alignment.field
+        if field is None:
             return False
-        return FieldCheck.read(self._value).disturbed(self._field, es.attitude(self.state))
+        return FieldCheck.read(self._value).disturbed(field, es.attitude(self.state))
 
     def accuracy(self) -> tuple[float, float]:
         """Return the standard deviations of horizontal position [m] and velocity [m/s]."""
@@ -451,7 +448,6 @@ class Estimator:
     def align(self) -> None:
         """Align attitude, height and place by what was averaged at rest, if that is enough."""
         aligned = self._alignment.finish()
-        self._field = self._alignment.field
         if aligned is None:
             return
         self.aligned = self.is_changed = True
