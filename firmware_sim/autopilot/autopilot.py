@@ -42,7 +42,7 @@ from firmware_sim.autopilot.home import Home
 from firmware_sim.autopilot.land_detector import LandDetector
 from firmware_sim.autopilot.manual_control import ManualControl, Source, Sticks
 from firmware_sim.autopilot.navigation.flown_item import Situation
-from firmware_sim.autopilot.navigation.navigator import Navigator
+from firmware_sim.autopilot.navigation.navigator import IDLE_US, Navigator
 from firmware_sim.autopilot.navigation.plan import Plans
 from firmware_sim.autopilot.navigation.whereabouts import Whereabouts
 from firmware_sim.autopilot.newest_sensors import NewestSensors
@@ -118,6 +118,8 @@ class BuiltinAutopilot:
         """The commander's state and the setpoint that the newest decision is of."""
         self._decided_healthy = 0
         """Whether the estimator was healthy then, 0 or 1."""
+        self._navigated_on: tuple[object, ...] = ()
+        """State, home, and numbers of changes of plans and parameters at the newest step."""
         self._newest = NewestSensors(record)
         self._home = Home(self.estimator, self._guidance)
         self._whereabouts = Whereabouts(self.estimator, self._newest, self._home, value)
@@ -275,14 +277,19 @@ class BuiltinAutopilot:
         return self._controller.motors
 
     def _navigate(self) -> None:
-        situation, flight = self._situation(), self._commander.flight
+        navigator, flight = self._navigator, self._commander.flight
+        armed = flight.phase >= _GROUND
+        if not armed:
+            self._home.stands()
+        on = flight, self._home.place, self.plans.changes, self.parameters.revision
+        if on == self._navigated_on and navigator.idle:
+            navigator.due_us = self._taken_us + IDLE_US
+            return
+        situation = self._situation()
         if situation is not None:
-            armed = flight.phase >= _GROUND
-            if not armed:
-                self._home.stands()
-            place = self._whereabouts.fenced_place
-            self._navigator.step(situation, flight.mode, place, armed=armed)
-            self._navigator.tell(self._guidance.context, self.supervisor.watch.reports)
+            self._navigated_on = on
+            navigator.step(situation, flight.mode, self._whereabouts.fenced_place, armed=armed)
+            navigator.tell(self._guidance.context, self.supervisor.watch.reports)
 
     def _return_place(self) -> Place | None:
         """Return where Return goes: home, or what RTL_TYPE prefers."""

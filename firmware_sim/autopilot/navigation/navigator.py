@@ -60,6 +60,8 @@ class Navigator:
         """What of the geofence is breached."""
         self.due_us = 0
         """When to step next [µs]; 0 = at once."""
+        self.idle = False
+        """Whether steps change nothing as long as mode, plans, home and parameters stay."""
         self._crew = crew
         self._returned = False
         """Whether the way of the present return has been chosen."""
@@ -179,6 +181,8 @@ class Navigator:
         self.due_us = situation.time_us + (PERIOD_US if mode in _LED else IDLE_US)
         self._position = situation.position
         self.fence.step(situation, mode, place)
+        led = mode in _LED or self._value("BAT1_CAPACITY") > 0.0
+        self.idle = not (led or self.fence.is_set or any(self.fence.status.breached))
         flying = armed and mode is Mode.MISSION
         self._step_home(situation, returning=armed and mode is Mode.RETURN)
         if flying and not self._flying:
