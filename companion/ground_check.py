@@ -1,8 +1,4 @@
-"""Pre-flight check on the ground: `airl-companion --check`.
-
-Camera, flight controller and policy run as in flight for a few seconds, without arming or
-setpoints.
-"""
+"""Pre-flight check without arming: camera, flight controller and policy for a few seconds."""
 
 from __future__ import annotations
 

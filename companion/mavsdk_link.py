@@ -1,7 +1,4 @@
-"""The companion's link to the flight controller: MAVSDK's synchronous API, without a thread hop.
-
-MAVSDK repeats setpoints at 20 Hz from its own thread, even when this process hangs: `watchdog.py`.
-"""
+"""The companion's link to the flight controller: MAVSDK's synchronous API, without a thread hop."""
 
 from __future__ import annotations
 
@@ -41,7 +38,7 @@ HEALTH_SETTLE_S = 0.5
 """Time that health must be good before arming: more than two of PX4's 5 Hz reports [s]."""
 
 OFFBOARD_SETTLE_S = 0.1
-"""Wait after the switch to offboard [s]. PX4 acknowledges it before all of its parts know: a
+"""Wait after the switch to offboard [s]. PX4 acknowledges it before all of its parts know. A
 setpoint that comes within some 10 ms is dropped, and MAVSDK repeats it only 50 ms later."""
 
 OFFBOARD_REPEAT_S = 0.05
@@ -88,14 +85,10 @@ class MavsdkLink:
     ) -> None:
         """Open a connection, as `open_connection`; `connect` waits for the vehicle.
 
-        Args:
-            url: MAVSDK connection.
-            clock: For timeouts.
-            abandon: Set from another thread to end any wait.
-            heard: Whether the flight controller is received, independent of wall time; None =
-                MAVSDK decides.
-            poll: Sleeps for an interval [µs], and again while a condition need not be checked;
-                None = it is checked after every interval.
+        `abandon`, set from another thread, ends any wait. `heard` says whether the flight
+        controller is received, independent of wall time; None = MAVSDK decides. `poll` sleeps for
+        an interval [µs], and again while a condition need not be checked; None = it is checked
+        after every interval.
         """
         self.url = url
         self._clock = clock
@@ -134,7 +127,7 @@ class MavsdkLink:
     def prepare(self, timeout_s: float, stop: threading.Event | None = None) -> None:
         """Prepare a connection that may have seen other missions.
 
-        The flight controller may be a different one or have restarted: cached state is dropped and
+        The flight controller may be a different one or have restarted. Cached state is dropped and
         streams are requested anew, unless right after `connect`. Raises LinkError after a timeout
         [wall s], without streams, or on `stop`.
         """
@@ -283,7 +276,7 @@ class MavsdkLink:
     ) -> None:
         """Wait until the flight controller reports good health, then arm; `stop` ends the wait.
 
-        Right after a reboot a health report may be out of date: it must have been good for a while,
+        Right after a reboot a health report may be out of date. It must have been good for a while,
         and a refused request is repeated. `origin` (latitude, longitude [deg], altitude [m]) is
         sent to a flight controller without a position.
         """
@@ -343,11 +336,7 @@ class MavsdkLink:
         self._pause(OFFBOARD_SETTLE_S)
 
     def await_hover(self, altitude_m: float, timeout_s: float, stop: threading.Event) -> None:
-        """Wait until telemetry shows a vehicle that hovers near an altitude above the start.
-
-        The position arrives at 50 Hz, armed and landed state once a second. `stop`, set from
-        outside, ends the wait.
-        """
+        """Wait until telemetry, once a second, shows a vehicle that hovers near an altitude."""
         deadline_us = self._deadline(timeout_s)
         while not -float(self.kinematics().position[2]) > altitude_m / 2:  # NaN before the first
             self._check(deadline_us, f"not in the air after {timeout_s:g} s", stop)
@@ -356,8 +345,7 @@ class MavsdkLink:
     def await_offboard(self, stop: threading.Event) -> None:
         """Send zero velocity until a pilot has switched the vehicle to offboard, or on `stop`.
 
-        PX4 rejects offboard without setpoints, and MAVSDK stops them at each heartbeat of another
-        mode.
+        PX4 rejects offboard without setpoints, and MAVSDK stops them at heartbeats of other modes.
         """
         while not self._flies_offboard():
             self._check(None, stop=stop)

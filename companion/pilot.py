@@ -1,7 +1,7 @@
 """The decision loop: observe -> infer -> act, and hold; every step stamped.
 
-Sequential, as in the paper, or pipelined: then nothing is held, and the next decision begins as
-soon as the last one is ready. While a decision is computed, the last command keeps flying; where
+Sequential, as in the paper, or pipelined. Then nothing is held, and the next decision begins as
+soon as the last one is ready. While a decision is computed, the last command keeps flying. Where
 that is compensated, the policy sees what will be when its action is sent.
 """
 
@@ -101,10 +101,7 @@ class Pilot:
         self.memory = DecisionMemory(1) if compensator is None else compensator.memory
 
     def fly(self, goal: Goal, stop: Event) -> str:
-        """Decide until the goal is reached or the flight ends; return the reason in words.
-
-        `Limits.ending` describes a broken limit. Raises LinkError when setpoints are refused.
-        """
+        """Decide until the goal is reached or the flight ends; return the reason in words."""
         sequence = -1
         if self.limits is not None:
             self.limits.begin(self.clock.time_us())

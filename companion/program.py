@@ -199,19 +199,10 @@ def fly_alone(
     waiting: Callable[[], None],
     progress: Callable[[str, int], None],
 ) -> MissionResult:
-    """Fly one mission with a real flight controller.
+    """Fly one mission with a real flight controller; `stop` lands, `abandon` ends without landing.
 
-    Args:
-        asked: Connections of flight controller and camera.
-        mission: The mission.
-        stop: Set to land and end.
-        abandon: Set to end without landing.
-        waiting: Called before waiting for the flight controller.
-        progress: Called with each phase as it begins, and its time [µs].
-
-    Raises:
-        UsageError: An address is unusable, or the policy cannot use the camera.
-        LinkError: No flight controller is heard, or it was lost.
+    `waiting` is called before waiting for the flight controller. Raises UsageError for an unusable
+    address or camera, and LinkError.
     """
     clock = WallClock(asked.speed)
 

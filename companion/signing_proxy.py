@@ -28,10 +28,7 @@ _URL = re.compile(r"udp(?:in)?://(?P<host>[^:/]*):(?P<port>\d+)")
 
 @contextmanager
 def signed(url: str, key: Path | None) -> Iterator[str]:
-    """Yield the URL for MAVSDK: the original, or with a key that of a proxy before it.
-
-    A LinkError from it names the URL and rejected frames: a different key shows nothing else.
-    """
+    """Yield the URL for MAVSDK: the original, or that of a proxy that signs with a key."""
     if key is None:
         yield url
         return

@@ -16,7 +16,7 @@ from airl_mav.core.constants import US_PER_S
 
 GIMBAL_PORT: Final = 13_280
 """Where PX4 SITL's instance 0 sends what it forwards to a gimbal (px4-rc.mavlink), and the built-in
-flight controller of `airl-firmware`, too: a link that is fast enough, and is nobody else's here."""
+flight controller of `airl-firmware`, too. A link that is fast enough, and is nobody else's here."""
 
 LEAST_PX: Final = 320
 """A picture is enlarged by a whole factor until it is at least so wide, each pixel a square."""

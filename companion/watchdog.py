@@ -110,7 +110,7 @@ class Watchdog:
         """Have the flight controller hold the vehicle where it is."""
         last = self._last
         # PX4 flies a velocity after body rates, or an attitude, up to half a second later, and the
-        # last of those until then: it must neither turn on, nor lean.
+        # last of those until then. It must neither turn on, nor lean.
         if isinstance(last, BodyRates):
             self._link.send_setpoint(BodyRates(0.0, 0.0, 0.0, last.thrust))
         elif isinstance(last, Attitude):

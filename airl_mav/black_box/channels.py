@@ -1,8 +1,7 @@
 """Messages as bytes with their channels, for files and live streams.
 
 Foxglove's parser (packages/mcap-support/src/parseJsonSchema.ts in foxglove/studio) requires one
-plain `type` per property, one `items` per array and base64 bytes; it supports neither references
-nor alternatives.
+plain `type` per property, one `items` per array and base64 bytes.
 """
 
 from __future__ import annotations
@@ -19,10 +18,7 @@ UNKNOWN = "null: not known"
 
 
 def foxglove_schema(kind: type[Any]) -> dict[str, Any]:
-    """Return the JSON schema of a message class without references.
-
-    Nullable fields keep their type and say so in the description; tuples have one element type.
-    """
+    """Return the JSON schema of a message class; a description says which fields are nullable."""
     schema = TypeAdapter(kind).json_schema()
     return _plain(schema, schema.get("$defs", {}))
 

@@ -3,7 +3,7 @@
 Messages are JSON with a JSON Schema, made of the classes here, for any reader of MCAP (Foxglove,
 `mcap cat`, pandas). Images and texts have Foxglove's schemas
 (https://docs.foxglove.dev/docs/visualization/message-schemas/introduction). Times `*_us` count from
-the companion's start [µs]; world frames are NED from the start of the flight, bodies FRD.
+the companion's start [µs]. World frames are NED from the start of the flight, bodies FRD.
 """
 
 from __future__ import annotations
@@ -243,10 +243,7 @@ ENCODINGS: dict[str, tuple[str, int]] = {
 
 
 def image_message(image: NDArray[Any], unix_us: int, camera: str = "camera") -> RawImage:
-    """Return the message of a depth (h, w) [mm] or colour (h, w, c) image at a calendar time [µs].
-
-    The topic of an additional camera is the main one, a slash and its name.
-    """
+    """Return the message of a depth (h, w) [mm] or colour (h, w, c) image at calendar time."""
     height, width, *channels = image.shape
     encoding = "mono16" if not channels else "rgb8" if channels == [3] else "mono8"
     rows = np.ascontiguousarray(image, ENCODINGS[encoding][0])

@@ -26,11 +26,7 @@ class McapFile:
     """An MCAP file with the messages of a flight."""
 
     def __init__(self, file: IO[bytes], run: Mapping[str, Any], *, in_chunks: bool = True) -> None:
-        """Begin an empty file; `run` is the content of `run.json`.
-
-        Chunks are compressed and indexed, so that viewers can seek; without chunks every message is
-        readable as soon as it is on the disk.
-        """
+        """Begin an empty file; chunks are compressed and indexed, but lost by a crash."""
         self._writer = Writer(
             file,
             compression=CompressionType.ZSTD if in_chunks else CompressionType.NONE,

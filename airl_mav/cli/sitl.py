@@ -60,10 +60,7 @@ OPTIONS = SitlOptions
 
 
 def run(options: SitlOptions, console: Console | None = None) -> int:
-    """Fly the rest of the episodes and write the report.
-
-    Returns 0, 1 if an episode was lost too often, 3 to 5 as of the verdict, 130 after Ctrl-C.
-    """
+    """Fly the rest, write the report; return 0, 1 (lost), 3 to 5 (verdict) or 130 (Ctrl-C)."""
     voice = Voice(options, "airl-sitl", console)
     requirements = requirements_of(options, reference=False)
     view = view_of(options)

@@ -143,17 +143,7 @@ class Voice:
         runs: Mapping[str, LoadedRun] | None = None,
         more: Sequence[str] = (),
     ) -> None:
-        """Write the machine-readable result.
-
-        Args:
-            exit_status: Of the command.
-            ended: "complete", "interrupted" or "broken off".
-            path: Output folder.
-            verdict: The verdict.
-            page: The report.
-            runs: Runs with flights, by name.
-            more: Additional lines of the result.
-        """
+        """Write the result of a command, which has "complete", is "interrupted" or "broken off"."""
         lines = () if verdict is None else verdict.lines
         if self._json is not None:
             told = tuple(_told(name, run) for name, run in (runs or {}).items())

@@ -50,10 +50,7 @@ EXTRAS = ("sim", "train")
 def run(
     options: TrainOptions, console: Console | None = None, *, command_line: str | None = None
 ) -> int:
-    """Train, export, and print the result; return 0, or 130 after Ctrl-C.
-
-    `command_line` is recorded on the card. Raises UsageError as `airl_mav.training.run.train`.
-    """
+    """Train, export, and print the result; return 0, or 130 after Ctrl-C."""
     from airl_mav.envs.delay import injections_of, speed_bound
 
     asked = view_of(options)

@@ -1,6 +1,6 @@
 """The vehicle under test: MAVSDK's calls, and raw messages through MAVSDK.
 
-Timeouts follow the vehicle's clock, at any simulation speed; silence is measured by the wall clock.
+Timeouts follow the vehicle's clock, at any simulation speed. Silence is measured by the wall clock.
 """
 
 from __future__ import annotations

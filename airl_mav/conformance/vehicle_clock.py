@@ -1,6 +1,6 @@
 """The vehicle's time at the moment when something is sent to it.
 
-The vehicle is asked for its time right before: between that exchange of a few milliseconds and the
+The vehicle is asked for its time right before. Between that exchange of a few milliseconds and the
 setpoint that follows, neither the clocks' drift nor the pace of a simulation matters (F. Cristian,
 "Probabilistic clock synchronization", Distributed Computing 3, 1989).
 """

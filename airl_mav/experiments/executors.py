@@ -23,7 +23,7 @@ Work = Callable[[J], Iterable[R]]
 
 Start = Callable[[Stop], Work[J, R]]
 """Called once in each worker, to load everything. Goes there by pickle. It is given what asks
-whether the work is to be stopped, for work in this process; other workers are ended instead."""
+whether the work is to be stopped, for work in this process. Other workers are ended instead."""
 
 Results = Generator[tuple[J, R], None, None]
 """Results as they come, each with its job. Closing it ends the workers, whatever they do."""
@@ -69,15 +69,11 @@ class Executor(Protocol):
         lost: Callable[[str], None] = lambda _: None,
         compiling: Heard = lambda _: None,
     ) -> Results[J, R]:
-        """Run jobs on free workers and yield their results in any order.
+        """Run jobs, taken lazily, on free workers and yield their results in any order.
 
-        Args:
-            jobs: The jobs, taken lazily.
-            start: Initializes a worker.
-            name: Returns a job's name for messages.
-            stop: Polled several times a second; True aborts the running jobs.
-            lost: Called with one line per lost worker; its job restarts, without partial results.
-            compiling: Called when local workers begin and end compiling kernels.
+        `start` initializes a worker; `stop` is polled several times a second and aborts the running
+        jobs; `lost` is told in one line of each lost worker, whose job restarts without partial
+        results; `compiling` is called when local workers begin and end compiling kernels.
 
         Raises:
             UsageError: A job rejects its input.

@@ -107,10 +107,7 @@ def navigation_of(
     trace: Trace | None = None,
     compensator: Compensator | None = None,
 ) -> Navigation:
-    """Return the vectorized simulator of a scenario, `slots` flights at a time, or UsageError.
-
-    `trace` records; `compensator` is one of `slots` companions; None = the vehicle's.
-    """
+    """Return the vectorized simulator of a scenario, `slots` flights at a time, or UsageError."""
     asked = scenario.scenario
     return Navigation(
         environment_of(scenario),

@@ -57,19 +57,7 @@ def fly_live(
     announce: Callable[[], None] = lambda: None,
     view: ViewRequest | None = None,
 ) -> FlownRun:
-    """Fly the rest of a scenario one flight after the other, at level sitl or lockstep.
-
-    Args:
-        scenario: The scenario.
-        out: Run folder to create or resume; None = a new one.
-        progress: Progress display.
-        name: Name of a new run; None = by level and policy.
-        announce: Called before the first flight.
-        view: Live view in a browser; None = none.
-
-    Raises:
-        UsageError: Invalid input; earlier flights are kept.
-    """
+    """Fly the rest of a scenario one flight after the other, at level sitl or lockstep."""
     asked = scenario.scenario
     if asked.level == "gym":
         raise FieldError("level", asked.level, "lockstep or sitl; airl evaluate flies the twin")

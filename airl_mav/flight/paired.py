@@ -1,6 +1,6 @@
 """Paired comparison of two runs on the same seeds, with 95 % intervals and numbers of pairs.
 
-Pairing by seed removes the spread that the arenas add: two runs that differ little show it after
+Pairing by seed removes the spread that the arenas add. Two runs that differ little show it after
 far fewer flights than two runs of different seeds.
 """
 
@@ -70,7 +70,7 @@ class PairedComparison:
     """A run against a reference, over pairs of flights with the same seed.
 
     The difference of a mean is `100 (other - reference) / reference` percent, over the common
-    successes; that of the success rate is in percentage points, over all pairs.
+    successes. That of the success rate is in percentage points, over all pairs.
     """
 
     agreement: Agreement
@@ -90,10 +90,8 @@ def pair_by_seed(
 ) -> tuple[Pair, ...]:
     """Return the flights of the seeds that both runs hold, in the order of the reference.
 
-    An invalid flight was no test of the policy: its seed makes no pair.
-
-    Raises:
-        ValueError: A run holds a seed twice.
+    An invalid flight was no test of the policy: its seed makes no pair. Raises ValueError if a run
+    holds a seed twice.
     """
     first, second = _by_seed(reference), _by_seed(other)
     return tuple((first[seed], second[seed]) for seed in first if seed in second)
@@ -132,21 +130,11 @@ def common_successes(pairs: Sequence[Pair]) -> tuple[tuple[Quality, Quality], ..
 def tango(gained: int, lost: int, n: int) -> Estimate:
     """Return the difference of two paired proportions with Tango's 95 % score interval.
 
-    The differences that McNemar's test, generalised to them, does not reject (T. Tango,
-    Equivalence test and confidence interval for the difference in proportions for the paired-sample
-    design, Statistics in Medicine 17, 1998, 891-908). It keeps its coverage where few pairs differ,
-    and has a width where none does.
-
-    Args:
-        gained: Pairs of which only the other succeeded.
-        lost: Pairs of which only the reference succeeded.
-        n: All pairs.
-
-    Returns:
-        The difference other minus reference, as a fraction, -1 to 1.
-
-    Raises:
-        ValueError: More pairs differ than there are.
+    The differences that McNemar's test, generalised to them, does not reject (T. Tango, Equivalence
+    test and confidence interval for the difference in proportions for the paired-sample design,
+    Statistics in Medicine 17, 1998, 891-908). It keeps its coverage where few pairs differ, and has
+    a width where none does. Of n pairs, in those `gained` only the other succeeded, in those `lost`
+    only the reference. The difference is other minus reference, as a fraction, -1 to 1.
     """
     if min(gained, lost) < 0 or gained + lost > n:
         raise ValueError(f"gained={gained}, lost={lost}, n={n}: must be >= 0 and fit")
@@ -183,20 +171,10 @@ def _score(d: float, gained: int, lost: int, n: int) -> float:
 
 
 def relative_difference(reference: ArrayLike, other: ArrayLike) -> Estimate:
-    """Return by how much the mean of paired values differs, with a bootstrap 95 % interval.
+    """Return by how many percent the mean of paired values differs, with a bootstrap 95 % interval.
 
-    Whole pairs are drawn (BCa, seeded). One pair has no interval; pairs of one ratio have one of
-    width zero.
-
-    Args:
-        reference: Values (n,), > 0.
-        other: Values (n,) of the same seeds.
-
-    Returns:
-        100 (mean of other - mean of reference) / mean of reference [%].
-
-    Raises:
-        ValueError: The values are not paired, or one of the reference is not > 0.
+    Whole pairs (n,) are drawn (BCa, seeded). One pair has no interval. Pairs of one ratio have one
+    of width zero. Raises ValueError unless all values of the reference are > 0.
     """
     first, second = np.asarray(reference, np.float64), np.asarray(other, np.float64)
     if first.ndim != 1 or first.shape != second.shape:
@@ -221,11 +199,7 @@ def _percent(reference: Floats, other: Floats) -> Floats:
 def compare_pairs(
     reference: Sequence[EpisodeRecord], other: Sequence[EpisodeRecord]
 ) -> PairedComparison:
-    """Compare a run with a reference on the seeds that both hold.
-
-    Raises:
-        ValueError: A run holds a seed twice.
-    """
+    """Compare a run with a reference on their common seeds; see `pair_by_seed`."""
     pairs = pair_by_seed(reference, other)
     agreement = count_agreement(pairs)
     good = common_successes(pairs)
@@ -273,22 +247,13 @@ def compare_means(reference: ArrayLike, other: ArrayLike) -> Change:
 
 
 def median_ratio(reference: ArrayLike, other: ArrayLike) -> Estimate:
-    """Return the median over pairs of `100 (other / reference - 1)` [%]; see `median_of`.
-
-    Args:
-        reference: Values (n,), > 0.
-        other: Values (n,) of the same seeds.
-    """
+    """Return the median over pairs (n,) of `100 (other / reference - 1)` [%]; see `median_of`."""
     first, second = np.asarray(reference, np.float64), np.asarray(other, np.float64)
     return median_of(100.0 * (second / first - 1.0))
 
 
 def percent_change(reference: float, other: float) -> float:
-    """Return `100 (other - reference) / reference` [%]: above 0 where the other has more.
-
-    Raises:
-        ValueError: The reference is not > 0.
-    """
+    """Return `100 (other - reference) / reference` [%]; ValueError unless `reference` > 0."""
     if not reference > 0.0:
         raise ValueError(f"reference = {reference}: must be > 0")
     return 100.0 * (other - reference) / reference

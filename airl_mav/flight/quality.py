@@ -97,19 +97,11 @@ def measure_quality(
     decisions: Mapping[str, NDArray[Any]] | None = None,
     hold_s: float = 0.0,
 ) -> Quality:
-    """Measure an episode.
+    """Measure an episode from its start to the verdict.
 
-    Args:
-        trajectory: The whole episode, take-off included.
-        navigation_us: Start of navigation, simulated time [µs].
-        ended_us: Time of the verdict, simulated [µs].
-        computer_watts: What the computer draws from the pack [W].
-        pack_j: What the pack holds at the start (`Battery.energy_j`) [J]; None: not known.
-        decisions: Columns of the decision log, as in `latency.npz`; None: not known.
-        hold_s: How long an action is held [s]; 0: no decision has a deadline.
-
-    Raises:
-        ValueError: The end comes before the start.
+    `pack_j` is what the pack holds at the start (`Battery.energy_j`) [J]; `decisions` are the
+    columns of the decision log, as in `latency.npz`. Each None if not known. Actions held for 0 s
+    have no deadline.
     """
     if ended_us < navigation_us:
         raise ValueError(f"ended_us={ended_us} lies before navigation_us={navigation_us}")

@@ -97,9 +97,8 @@ class EpisodeRecord:
 def run_sha256(episodes: Sequence[EpisodeRecord]) -> str | None:
     """Return the fingerprint of a run: equal when all its flights are equal, bit by bit.
 
-    Returns:
-        SHA-256, hexadecimal, of the flights' own fingerprints in the order of their index, each a
-        line with its newline; None when there is none of a flight.
+    It is the SHA-256, hexadecimal, of the flights' own fingerprints in the order of their index,
+    each a line with its newline; None when there is none of a flight.
     """
     lines = []
     for record in sorted(episodes, key=lambda record: record.index):

@@ -69,7 +69,7 @@ class Trajectory:
 
         quaternion = linear(self._continuous_quaternion())
         quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
-        # Power is a mean over the step that ends at a sample: the step a time falls in has it.
+        # Power is a mean over the step that ends at a sample. The step a time falls in has it.
         return Trajectory(
             times, linear(self.position), linear(self.velocity), quaternion, self.power_w[before]
         )
@@ -118,15 +118,7 @@ class TrajectoryRecorder:
         self._power_w = 0.0
 
     def integrate(self, time_us: int, power_w: float) -> bool:
-        """Take the power of the tick that ends now; return whether a sample is due.
-
-        Args:
-            time_us: Simulated time [µs], later than the call before.
-            power_w: Electrical power over the tick that ends now [W].
-
-        Raises:
-            ValueError: Time does not advance.
-        """
+        """Take the mean power over the tick that ends now; return whether a sample is due."""
         last_us = self._last_us
         self._power_w = power_w
         if last_us is None:
@@ -141,13 +133,7 @@ class TrajectoryRecorder:
     def extend(
         self, times_us: Sequence[int], powers_w: Sequence[float], states: NDArray[np.float64]
     ) -> list[int]:
-        """Take n ticks; return which of them were sampled.
-
-        Args:
-            times_us: (n,) simulated time [µs].
-            powers_w: (n,) electrical power over the tick that ends then [W].
-            states: (n, >= 10) as `keep` takes them; copied.
-        """
+        """Take n ticks with states (n, >= 10); return which of them were sampled."""
         kept = []
         for k, (time_us, power_w) in enumerate(zip(times_us, powers_w, strict=True)):
             last_us, self._last_us, self._power_w = self._last_us, time_us, power_w
@@ -161,12 +147,8 @@ class TrajectoryRecorder:
     def keep(self, state: NDArray[np.float64]) -> None:
         """Sample the moment of the newest `integrate`.
 
-        Args:
-            state: (10,) position NED [m], velocity NED [m/s], quaternion [w, x, y, z] body ->
-                world. Kept as it is, not copied: it must not change afterwards.
-
-        Raises:
-            ValueError: Nothing was integrated yet.
+        `state` (10,) is position NED [m], velocity NED [m/s] and quaternion [w, x, y, z] body ->
+        world. It is not copied: it must not change afterwards.
         """
         time_us = self._last_us
         if time_us is None:

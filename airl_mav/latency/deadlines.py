@@ -12,18 +12,7 @@ from airl_mav.latency.stamps import NO_STAMP
 
 
 def deadline_miss_ratio(latencies: ArrayLike, deadline: float) -> float | None:
-    """Return the share of decisions that take longer than a deadline, 0 to 1.
-
-    Args:
-        latencies: (n,) how long each decision took; infinite for one that never took effect.
-        deadline: > 0, in the unit of the latencies. A decision that takes exactly as long keeps it.
-
-    Returns:
-        None where there is no decision.
-
-    Raises:
-        ValueError: The deadline is not > 0.
-    """
+    """Return the share of decisions that miss a deadline, 0 to 1; None: no decisions."""
     if not deadline > 0.0:
         raise ValueError(f"deadline={deadline}: must be > 0")
     values = np.asarray(latencies, np.float64)
@@ -31,18 +20,11 @@ def deadline_miss_ratio(latencies: ArrayLike, deadline: float) -> float | None:
 
 
 def ages_at_effect(stamps: Mapping[str, NDArray[Any]]) -> NDArray[np.float64]:
-    """Return how old each decision's frame was when the decision took effect.
+    """Return the age [µs] of each decision's frame when the decision took effect.
 
     That is the stage `end_to_end`: exposure of the frame to the first motor command that reflects
     the decision. A decision that never took effect, although a later one of the flight did, is
-    infinitely old. Those after the last one that took effect were cut off by the end of the flight
-    and are left out.
-
-    Args:
-        stamps: Columns (n,) of an episode as in `latency.npz` [µs].
-
-    Returns:
-        (k,) ages [µs]; empty where nothing tells when motors reflect a decision (real firmware).
+    infinitely old. Those after the last one that took effect are left out.
     """
     if "capture_us" not in stamps or "motor_us" not in stamps:
         return np.zeros(0)

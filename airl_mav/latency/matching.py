@@ -1,6 +1,6 @@
 """Find when the flight controller accepted each setpoint that the companion sent.
 
-MAVSDK sends a setpoint at once and then again at 20 Hz until the next one, so the flight
+MAVSDK sends a setpoint at once and then again at 20 Hz until the next one. So the flight
 controller's log holds many copies of each. The first copy after a decision is that decision's.
 """
 
@@ -24,23 +24,12 @@ def match_setpoints(
     accepted_us: ArrayLike,
     accepted_values: ArrayLike,
 ) -> NDArray[np.int64]:
-    """Match each sent setpoint with the first accepted copy of it.
+    """Match each sent setpoint (n, 4) with the first accepted copy of it.
 
     A copy counts when it was accepted at or after the sending, before the next one was sent, and
     carries the same four numbers (NaN, an unused field, equals NaN). When a decision repeats the
-    one before, a resend of that one still under way counts as well: it commands the same.
-
-    Args:
-        sent_us: (n,) times at which setpoints were handed to MAVSDK [µs], increasing.
-        sent_values: (n, 4) what was handed over.
-        accepted_us: (m,) times at which the autopilot accepted setpoints [µs], not decreasing.
-        accepted_values: (m, 4) what it accepted.
-
-    Returns:
-        (n,) index into the accepted ones, `UNMATCHED` where there is none.
-
-    Raises:
-        ValueError: The shapes do not fit, or times go back.
+    one before, a resend of that one still under way counts as well. It commands the same. Return
+    the index (n,) into the accepted ones, `UNMATCHED` where there is none.
     """
     sent = np.asarray(sent_us, np.int64)
     accepted = np.asarray(accepted_us, np.int64)

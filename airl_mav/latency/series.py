@@ -24,15 +24,7 @@ FENCE_SHARE = 0.05
 
 
 def decision_series(stamps: Mapping[str, NDArray[Any]]) -> dict[str, Samples]:
-    """Return the duration [µs] of each stage of each decision of an episode, by the stage's key.
-
-    Args:
-        stamps: As for `stages.stage_durations`.
-
-    Returns:
-        Arrays (n,) for n decisions, `NO_STAMP` where one of a stage's stamps is missing. Without
-        the `NO_STAMP`s each is what `stage_samples` gives.
-    """
+    """Return the duration [µs] of each decision's stages (n,), `NO_STAMP` where it is unknown."""
     names = {name for stage in STAGES for name in (stage.start, stage.end)}
     n = max((len(stamps[name]) for name in names & stamps.keys()), default=0)
     series: dict[str, Samples] = {}

@@ -59,13 +59,10 @@ def stage_durations(
 ) -> dict[str, tuple[NDArray[np.int64], Samples]]:
     """Return the stages of an episode's decisions, by the stage's key.
 
-    Args:
-        stamps: The decision log's columns plus `accepted_us` and `motor_us`, each (n,) [µs].
-
-    Returns:
-        Two arrays (k,): the decisions that have the stage, and its durations [µs]. A stage lacks
-        the decisions where one of its two stamps is `NO_STAMP`, and is empty where a whole column
-        is missing. A decision period belongs to the decision that ends it.
+    Stamps are the decision log's columns plus `accepted_us` and `motor_us`, each (n,) [µs]. Of each
+    stage two arrays (k,): the decisions that have it, and its durations [µs]. A stage lacks the
+    decisions where one of its two stamps is `NO_STAMP`, and is empty where a whole column is
+    missing. A decision period belongs to the decision that ends it.
     """
     nothing: Samples = np.zeros(0, np.int64)
     found = {}

@@ -72,13 +72,7 @@ class DecisionLimit:
 
 
 def measure(request: ProfileRequest, policy: PolicyUnderTest, bar: Bar) -> Recording:
-    """Fly until there are enough decisions; arguments as `bare.measure`.
-
-    Raises:
-        UsageError: The request cannot be flown.
-        ProfilingError: No heartbeat, or the flight ended before there were enough decisions.
-        KeyboardInterrupt: Ctrl-C or SIGTERM; the vehicle was commanded to land.
-    """
+    """Fly until there are enough decisions; Ctrl-C lands. Arguments as `bare.measure`."""
     load_us, first_us, _ = cold_start(request, policy)
     interrupted, stop = threading.Event(), threading.Event()
 
@@ -166,11 +160,9 @@ def _fly(
 def relate_stamps(mission: TimedMission, warm_up: int) -> tuple[Stamps, str, tuple[str, ...]]:
     """Convert the frames' exposure to this computer's clock, if the clocks can be related.
 
-    Returns:
-        Columns after the warm-up, with `exchange_*` columns of one row per exchange in flight; the
-            stamp from which command age counts; remarks. `capture_us` is the exposure by this
-            computer's clock, within `capture_uncertainty_us`, `capture_simulator_us` by the
-            simulator's.
+    Return columns after the warm-up, with `exchange_*` columns of one row per exchange in flight;
+    the stamp from which command age counts; remarks. `capture_us` is the exposure by this
+    computer's clock, within `capture_uncertainty_us`, `capture_simulator_us` by the simulator's.
     """
     columns = mission.result.log.columns()
     stamps = {name: np.asarray(columns[name][warm_up:], np.int64) for name in STAMPS}

@@ -1,33 +1,26 @@
-"""Drag and wind, from what the air does across the body's axis.
+"""Drag and wind, from the acceleration across the body's axis.
 
-Rotors push along the body's axis, so what accelerates a vehicle across it is the air: with the
-drag D per mass, k = D / m, and the wind w, a velocity v is braked by k (v - w).
+With the drag D per mass, k = D / m, and the wind w, the air brakes a velocity v by k (v - w). The
+rotors push along the body's axis only. Both fits are linear in k and k w.
 
-The vehicle's log holds what the accelerometer felt, in which gravity is not: along the body's x
-and y axes
+The vehicle's log holds the acceleration that is felt, along the body's x and y axes:
 
     a = -k R' (v - w) + b + c (w_y, -w_x)
 
-R' turns from NED to the body's axes. The attitude hardly matters: five milliradians of it change a
-by as much as they turn (v - w). b is the accelerometer's bias, with a normal prior, and is told
-from the wind by flying with several headings. w_x and w_y are the rates of roll and pitch: rotors
-above the centre of mass feel the air that these blow past them, and where a sample is the mean of
-the time since the one before, it is turned by what the vehicle has turned meanwhile. (PX4's own
-estimator tells drag from wind so: EKF2_DRAG_CTRL.)
+R' turns from NED to the body's axes. b is the accelerometer's bias, with a normal prior. Several
+headings tell it from the wind. w_x and w_y are the rates of roll and pitch. Rotors above the centre
+of mass feel their wind. A sample that is a mean is turned by them. (PX4's own estimator tells
+drag from wind so: EKF2_DRAG_CTRL.)
 
-Telemetry has no accelerometer. There the same is found in how the vehicle leans, and what it gains
-of that:
+Telemetry has no accelerometer. There the lean of the vehicle accelerates it.
 
     v' = g + f z - k (v - w)
 
-z is the body's up axis, f the thrust per mass, which the vertical part of the equation gives. The
-level part is averaged over windows of half a second. Here an error of the attitude, as of an
-accelerometer that is biased, looks like wind while the heading stays. It is estimated along with
-the rest, as a bias along the body's axes with a normal prior: of the profile's accelerometer until
-the vehicle has manoeuvred, and smaller after, when an estimator has told tilt and bias apart. So
-the interval of the wind is wide where the flight is short, or the drag small.
-
-Both are linear in k and k w.
+z is the body's up axis, f the thrust per mass, from the vertical part of the equation. The level
+part is averaged over windows of half a second. An error of the attitude looks like wind while the
+heading stays. It is estimated as a bias along the body's axes with a normal prior. That is of the
+profile's accelerometer until the vehicle has manoeuvred, and smaller after. So the interval of the
+wind is wide where the flight is short, or the drag small.
 """
 
 from __future__ import annotations
@@ -59,19 +52,19 @@ LEARNT_SHARE = 0.6
 first twenty flights of benchmarks/bench_refit.py and 24 of PX4 1.16."""
 
 BY_RATE_M_S = 0.1
-"""How much of a rate the accelerometer may feel as acceleration [m/s² for 1 rad/s]: a thrust of 1 g
+"""How much of a rate the accelerometer may feel as acceleration [m/s² for 1 rad/s]. A thrust of 1 g
 that is turned by a sample's time of 4 ms is 0.04, drag of 0.2 1/s on rotors 10 cm up 0.02."""
 
 OFF_M_S, OFF_S = 0.03, 4.0
 """An estimator's velocity is off by so much along an axis [m/s], and for so long by about the same
-[s]: what PX4 1.16 estimated in twelve simulated flights whose truth is known. The accelerometer's
-equations take it for wind."""
+[s]. That is what PX4 1.16 estimated in twelve simulated flights whose truth is known. The
+accelerometer's equations take it for wind."""
 
 SKEW_S = 0.01
 """By how much attitude and velocity in telemetry may be of different moments [s]."""
 
 UNSEEN = 2.0
-"""Errors of an estimator and gusts change slower than a short flight shows: the variance is so many
+"""Errors of an estimator and gusts change slower than a short flight shows. The variance is so many
 times that which the rows show. Chosen on the first twenty flights of benchmarks/bench_refit.py."""
 
 LEAST_ROWS = 4 * WINDOW
@@ -205,8 +198,7 @@ def _estimate(
 def _felt_rows(flown: Flown, bias_m_s2: float) -> _Rows | None:
     """Return the equations of the accelerometer across the body's axis, if logged.
 
-    The sensor's raw data are corrected by the estimator's final bias, since its bias in flight
-    changes as it learns.
+    The raw data are corrected by the estimator's final bias, as its bias changes while it learns.
     """
     log = flown.log
     if log is None:
@@ -243,8 +235,8 @@ def _learnt_bias(log: VehicleLog, start_us: float, end_us: float) -> Array | Non
 def _lean_rows(flown: Flown, bias_m_s2: float) -> _Rows | None:
     """Return the equations of telemetry: velocity gained in a window against lean and drag.
 
-    An estimator's attitude and velocity differ slightly in time. In oscillating flight, a lean that
-    is early by d looks like a drag of d w², w the angular frequency, so d is estimated too.
+    In oscillating flight, a lean that is early by d looks like a drag of d w², w the angular
+    frequency. So d is estimated, too.
     """
     path = flown.path.between(*flown.airborne_us)
     if len(path) < LEAST_ROWS:

@@ -64,15 +64,9 @@ def block_intervals(
 ) -> Array:
     """Return the offsets of 95 % intervals from a least-squares solution, lower and upper (2, k).
 
-    Neighbouring residuals are correlated, so blocks of seconds are resampled; each resample moves
+    Neighbouring residuals are correlated. So blocks of seconds are resampled. Each resample moves
     the solution by one Gauss-Newton step (one-step bootstrap). Student's t accounts for the few
     blocks. Unobservable parameters have infinite intervals.
-
-    Args:
-        jacobian: (n, k) of the residuals.
-        residuals: (n,) at the solution.
-        times_s: (n,) of the residuals [s].
-        rng: Generator of the resamples.
     """
     block = np.unique(np.floor((times_s - times_s.min()) / BLOCK_S), return_inverse=True)[1]
     count = int(block.max()) + 1

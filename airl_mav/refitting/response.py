@@ -95,11 +95,7 @@ class _Solution:
 
 
 def fit_response(flown: Flown, known: Response | None, rng: np.random.Generator) -> ResponseFit:
-    """Fit the response of a flight's vehicle; `known` is the profile's.
-
-    With the vehicle's log the dead time counts from when the flight controller took the setpoint;
-    otherwise it includes the link.
-    """
+    """Fit the response of a flight's vehicle; without its log the dead time includes the link."""
     velocity, turn = _describe(known)
     if (why := _too_little(flown)) is not None:
         fit = ResponseFit(*(replace(each, unobservable=why) for each in (*velocity, turn)))
@@ -177,8 +173,8 @@ def _velocity(
 ) -> tuple[FittedQuantity, FittedQuantity]:
     """Fit dead time and time constant to the velocities north and east together.
 
-    A companion's setpoints are in the heading frame, so the heading's time is a third parameter:
-    their arrival, before the response. Logged setpoints are already in the world frame.
+    A companion's setpoints are in the heading frame. So the time of the heading, their arrival, is
+    a third parameter. Logged setpoints are in the world frame.
     """
     grid = driven.grid_s
 

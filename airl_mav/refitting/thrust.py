@@ -1,8 +1,7 @@
 """Thrust per mass, from motor commands and the accelerometer along the body's axis.
 
-The accelerometer measures thrust / m less the drag's part, motor commands the share of maximum
-thrust, so that their ratio is thrust_max / m. Means over the flight cancel rotor lag and vibration,
-not an error of the learnt accelerometer bias.
+The accelerometer measures thrust / m less the drag's part. Motor commands are the share of maximum
+thrust. So their ratio is thrust_max / m. Means over the flight cancel rotor lag and vibration.
 """
 
 from __future__ import annotations
@@ -46,10 +45,7 @@ class Thrust:
 def fit_thrust(
     flown: Flown, vehicle: VehicleProfile, air: Air, known: Known, rng: np.random.Generator
 ) -> Thrust:
-    """Fit maximum thrust per mass, and from it whichever of mass and thrust is unknown.
-
-    Without the vehicle's log the motor commands are unknown; `vehicle` has its payload.
-    """
+    """Fit maximum thrust per mass, and from it whichever of mass and thrust is not `known`."""
     ratio = vehicle.thrust_n / vehicle.body.mass_kg
     blank = unobserved("thrust_per_mass_m_s2", "thrust per mass", "m/s²", "", ratio)
     return thrust_of(_ratio(flown, vehicle, air, blank, rng), vehicle, known)
@@ -137,7 +133,7 @@ def _ratio(
 def _shares(commands: Array, log: VehicleLog, vehicle: VehicleProfile) -> Array:
     """Return motor commands (n, 4) as shares of maximum thrust.
 
-    PX4's actuator_motors are thrusts where THR_MDL_FAC describes the motors' curve; only its
+    PX4's actuator_motors are thrusts where THR_MDL_FAC describes the motors' curve. Only its
     outputs are bent (src/lib/mixer_module/functions/FunctionMotors.hpp).
     """
     curve = 0.0 if log.parameters.get("THR_MDL_FAC") else vehicle.rotor.thrust_curve

@@ -1,8 +1,7 @@
 """A vehicle's profile from several flights' logs together.
 
-Each flight is fitted alone; what it tells of the vehicle is then averaged. Flights of one vehicle
-differ by more than their intervals say, so the mean is that of a random-effects model: a flight's
-value differs from the vehicle's by its own error, and by a spread that all of them share
+Each flight is fitted alone. The mean of a random-effects model joins them. There a flight's value
+differs from the vehicle's by its own error. It also differs by a spread that all of them share
 (DerSimonian and Laird, Meta-analysis in clinical trials, Controlled Clinical Trials 7, 1986).
 """
 

@@ -1,7 +1,4 @@
-"""The companion process of a rehearsal: MAVSDK, camera and policy, missions on request.
-
-Its standard input brings the resolved scenario in one line, then requests; see `rehearsal.channel`.
-"""
+"""The companion process of a rehearsal: MAVSDK, camera and policy, missions on request."""
 
 from __future__ import annotations
 
@@ -52,11 +49,7 @@ class Missions:
     def __init__(
         self, scenario: ResolvedScenario, channel: ChildChannel, tap: CompanionTap | None = None
     ) -> None:
-        """Load the policy; nothing is connected yet.
-
-        A `tap` shows the decisions, to those who may set how late they are. Raises UsageError if
-        the policy cannot be run.
-        """
+        """Load the policy, or raise UsageError; nothing is connected yet."""
         self._scenario = scenario
         self._tap = tap
         self._channel = channel
@@ -73,7 +66,7 @@ class Missions:
         if isinstance(request, Fly):
             self._stop.clear()
             self._abandon.clear()
-            # Shared for one flight, then left alone: what lasts a while (holding an action, the
+            # Shared for one flight, then left alone. What lasts a while (holding an action, the
             # watchdog) must not jump when the simulator gives up time. The rehearsal corrects the
             # stamps afterwards.
             if request.epoch_ns is not None:
@@ -81,12 +74,7 @@ class Missions:
         self._requests.put(request)
 
     def run(self) -> None:
-        """Fly what is asked for, until it is time to end.
-
-        Raises:
-            UsageError: The policy cannot use the camera.
-            LinkError: No flight controller is heard.
-        """
+        """Fly the requested missions until the end; UsageError: the camera does not fit."""
         aircraft, clock = self._scenario.scenario, self._clock
         camera_port = aircraft.open_ports.camera_port
         use = UseMeter(WallClock())

@@ -31,7 +31,7 @@ from airl_mav.scenario.resolved import ResolvedScenario
 from companion.interfaces import CAMERA_SILENT, FRAMES_LATE, LINK_LOST, TELEMETRY_FROZEN
 
 SEPARATED = (LINK_LOST, CAMERA_SILENT, TELEMETRY_FROZEN, FRAMES_LATE)
-"""Why a mission ends when both processes live but no longer hear each other: one of them stood
+"""Why a mission ends when both processes live but no longer hear each other. One of them stood
 still for seconds, or the host has too much to do."""
 
 DISTURBING = (*PROCESSES, *LINKS, "camera")
@@ -81,14 +81,7 @@ class Episode:
 def join_episode(
     episode: Episode, scenario: ResolvedScenario, record_path: Path, decisions_path: Path
 ) -> FlownEpisode:
-    """Join what both processes left of an episode.
-
-    Args:
-        episode: The episode, judged.
-        scenario: What was flown.
-        record_path: The firmware's arrays.
-        decisions_path: The companion's decision log; may be missing.
-    """
+    """Join what both processes left of a judged episode; the companion's log may be missing."""
     arrays = _read(record_path)
     trajectory = Trajectory.from_arrays(part_of(arrays, "trajectory"))
     latency = part_of(arrays, "estimate", keep_prefix=True)
@@ -188,17 +181,10 @@ def judged_record(
     started_us: int,
     **known: Any,
 ) -> EpisodeRecord:
-    """Return the record of a flight that a referee has watched.
+    """Return the record of a flight that a referee has watched; one without a verdict is aborted.
 
-    Args:
-        scenario: What was flown.
-        referee: Who judged; a flight without a verdict is aborted.
-        trajectory: The true path.
-        latency: The columns of its decisions.
-        navigation_us: When navigation began, by the clock of the trajectory [µs]; None: never.
-        seed: Of the episode.
-        started_us: When it began, by the same clock [µs].
-        known: The fields of `EpisodeRecord` that neither scenario nor referee tells.
+    Navigation began, and the episode started, by the clock of the trajectory [µs]. `known` are the
+    fields of `EpisodeRecord` that neither scenario nor referee tells.
     """
     verdict = referee.verdict or referee.abort(started_us, "no verdict")
     quality = None
@@ -260,10 +246,7 @@ def join_stamps(
 ) -> dict[str, NDArray[Any]]:
     """Return the decision log with the times at which the autopilot accepted and applied each.
 
-    Args:
-        decisions: The companion's log, by column.
-        setpoints: The firmware's log, by column; empty where nobody can look into it.
-        slips: (k, 2) times at which simulated time was given up, and how much [µs].
+    Slips (k, 2) are the times at which simulated time was given up, and how much [µs].
     """
     by_simulator = {name: without_slips(decisions[name], slips) for name in COMPANION_STAMPS}
     if not setpoints:
@@ -286,7 +269,7 @@ def without_slips(times_us: NDArray[np.int64], slips: NDArray[np.int64]) -> NDAr
     """Return times (n,) of a clock that ran on as the simulator's clock tells them [µs].
 
     Both agreed at the start of the episode. Each slip set the simulator's clock back to the tick
-    that was due: what happened while it stood still happened at that tick.
+    that was due. What happened while it stood still happened at that tick.
     """
     told = times_us.copy()
     given_up_us = 0

@@ -1,6 +1,6 @@
 """Saves episodes in batches, in a thread of its own.
 
-Episodes of the levels gym and lockstep end faster than single ones can be saved, and who flies or
+Episodes of the levels gym and lockstep end faster than single ones can be saved. Who flies or
 hands out flights must not wait for the disk. The files and what they promise are those of
 `RunFolder.save_episodes`.
 """
@@ -19,7 +19,7 @@ INTERVAL_S = 2.0
 
 INTERVAL_PER_SAVE = 9.0
 """Least time between two saves, in multiples of how long the last one took. Adding to an archive
-copies it: without this, saving would take most of the time of a run of ten thousand flights."""
+copies it. Without this, saving would take most of the time of a run of ten thousand flights."""
 
 MAX_WAITING = 1000
 """Most episodes that wait to be saved."""

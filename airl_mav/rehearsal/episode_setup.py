@@ -10,13 +10,7 @@ from firmware_sim.simulation import EpisodeSetup
 
 
 def episode_setup(resolved: ResolvedScenario, arena: Arena, seed: int) -> EpisodeSetup:
-    """Return the setup of an episode.
-
-    Args:
-        resolved: The scenario.
-        arena: Arena of the seed.
-        seed: Seed of sensors, wind and the aircraft's tolerances.
-    """
+    """Return the setup of an episode in the arena of a seed."""
     hover = None
     if resolved.scenario.start == "hover":
         place = None if resolved.vehicle.uses_gps else resolved.companion_pilot.origin

@@ -1,7 +1,4 @@
-"""The firmware process of a rehearsal: plant, flight controller and camera, episodes on request.
-
-Its standard input brings the resolved scenario in one line, then requests; see `rehearsal.channel`.
-"""
+"""The firmware process of a rehearsal: plant, flight controller and camera, episodes on request."""
 
 from __future__ import annotations
 
@@ -79,22 +76,12 @@ def build_firmware(
 ) -> Firmware:
     """Bind all ports and return the firmware without an episode.
 
-    Args:
-        aircraft: What was asked of it.
-        vehicle: What it flies.
-        pacing: How simulated time passes.
-        bind: IPv4 address that links and camera bind.
-        companion_host: IPv4 address of the companion computer.
-        gcs_host: IPv4 address of the ground station.
-        insecure: Whether addresses are allowed that other machines can reach.
-        log: What real firmware prints goes here; None: to a file in its folder.
-        parameters_file: Where the built-in autopilot keeps the parameters that users set; None: it
-            forgets them.
-        recording: Whether episodes are recorded, to be saved; without, they may last for ever.
-        bind_devices: Binds more links of the built-in flight controller, after the others.
+    Addresses are IPv4; `insecure` allows those that other machines can reach. What real firmware
+    prints goes to `log`, or into a file in its folder. The built-in autopilot keeps the parameters
+    that users set in `parameters_file`, or forgets them. Without `recording` episodes may last for
+    ever. `bind_devices` binds more links of the built-in flight controller, after the others.
 
-    Raises:
-        UsageError: A port is taken, an address unusable, or real firmware is not there.
+    Raises UsageError if a port is taken, an address unusable, or real firmware is not there.
     """
     ports = aircraft.open_ports
 
@@ -167,12 +154,7 @@ class Service:
         }
 
     def run(self, requests: queue.Queue[Any]) -> None:
-        """Fly until it is time to end.
-
-        Raises:
-            UsageError: An episode cannot be made.
-            FirmwareLostError: Real firmware is gone.
-        """
+        """Fly until the end; UsageError if an episode cannot be made, or FirmwareLostError."""
         while self._handle_all(requests):
             self._firmware.step()
 

@@ -1,7 +1,4 @@
-"""Faults of the two processes in one episode: stopped, going on again, killed, as asked for.
-
-The firmware says when (`channel.Due`); it knows the time and the phases of the flight.
-"""
+"""Faults of the two processes in one episode, at the firmware's `channel.Due`."""
 
 from __future__ import annotations
 
@@ -38,11 +35,7 @@ class ProcessFaults:
         return round((self._pair.suspended_us(FIRMWARE) - self._suspended_before_us) * self._speed)
 
     def carry_out(self, due: Due) -> str | None:
-        """Begin or end a fault.
-
-        Returns:
-            What was done, for the records; None: nothing.
-        """
+        """Begin or end a fault; return what was done, for the records, or None."""
         fault = Fault.model_validate(due.fault)
         name, kind, at_s = fault.part, fault.kind, due.time_us / US_PER_S
         if name in self._out:

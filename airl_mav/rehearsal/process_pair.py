@@ -39,10 +39,7 @@ LOOK_S = 0.2
 
 
 class LostError(Exception):
-    """A process died or hangs, or they lost each other: the flight is no test of anything.
-
-    The message says all that is known; `what` is one line for the records.
-    """
+    """A process died or hangs, or they lost each other; `what` is one line for the records."""
 
     def __init__(self, what: str, detail: str = "") -> None:
         super().__init__(what + detail)
@@ -62,16 +59,7 @@ class Child(ChildProcess):
         keeps: Sequence[int] = (),
         environment: Mapping[str, str] | None = None,
     ) -> None:
-        """Start `python -m module`.
-
-        Args:
-            name: What it is called in messages and in the queue.
-            module: Python module with a `__main__` guard.
-            log: Its standard error goes here.
-            events: Gets (name, event); after the last one (name, Exited).
-            keeps: File descriptors that it inherits and never uses: locks.
-            environment: Added to our own environment.
-        """
+        """Start `python -m module`; `events` gets (name, event), and (name, Exited) in the end."""
         super().__init__(
             [sys.executable, "-m", module],
             log,
@@ -131,18 +119,7 @@ class ProcessPair:
     def start(
         self, begin: Begin, logs: Path, keeps: Sequence[int], compiling: Callable[[], None]
     ) -> None:
-        """Start both processes and wait until they are ready.
-
-        Args:
-            begin: What both are told first.
-            logs: Folder that their standard error goes to.
-            keeps: File descriptors that they inherit: locks.
-            compiling: Called when one compiles kernels first.
-
-        Raises:
-            UsageError: A process says that its input cannot be used.
-            LostError: A process died or did not become ready in time.
-        """
+        """Start both processes and wait until they are ready, or raise UsageError or LostError."""
         self._scratch = tempfile.mkdtemp(prefix="airl-companion-")
         places = {COMPANION: {"TMPDIR": self._scratch}}
         for name, module in MODULES.items():
@@ -189,13 +166,7 @@ class ProcessPair:
         return not self._children[name].ending
 
     def suspend(self, name: str, for_s: float | None = None) -> None:
-        """Suspend a process, as a computer that hangs.
-
-        Args:
-            name: Which one.
-            for_s: It is resumed after so long, while events are waited for [wall s]; None: on
-                request.
-        """
+        """Suspend a process, as a computer that hangs, for some wall time or until `resume`."""
         now_us = self._clock.time_us()
         until_us = None if for_s is None else now_us + round(for_s * US_PER_S)
         self._children[name].suspend()
@@ -249,17 +220,10 @@ class ProcessPair:
         what: str,
         paused: Callable[[], bool] = lambda: False,
     ) -> None:
-        """Feed events to `take` until it returns True.
+        """Feed events, with the name of their process, to `take` until it returns True.
 
-        Args:
-            take: Gets the name of a process and what it says.
-            timeout_s: Longest wait [wall s].
-            what: What is waited for, in words.
-            paused: Whether the time does not count at present: a process compiles kernels.
-
-        Raises:
-            UsageError: A process says that its input cannot be used.
-            LostError: A process died or failed, or the time is over.
+        While `paused`, time does not count. Raises UsageError if a process says so, and LostError
+        if one died or failed, or the time [wall s] is over; `what` is waited for, in words.
         """
         since = WallClock()
         paused_us = before_us = 0

@@ -1,7 +1,7 @@
 """A rehearsal: two processes, N seeded episodes, one run folder, whatever happens to the processes.
 
 An episode is saved when it has been flown whole. One that lost a process on the way is flown again
-by two new ones, from its seed, and so is one that the host disturbed: nothing of them enters the
+by two new ones, from its seed. So is one that the host disturbed. Nothing of them enters the
 records but a note. What is still invalid after the last attempt is saved as such.
 """
 
@@ -68,15 +68,7 @@ class Rehearsal:
         keeps: Sequence[int] = (),
         view: ViewEnds | None = None,
     ) -> None:
-        """Take the scenario; nothing is started yet.
-
-        Args:
-            scenario: What is flown.
-            folder: Where everything goes.
-            observer: Who looks on.
-            keeps: File descriptors that the processes inherit: locks.
-            view: Where the flights are watched; None: nowhere.
-        """
+        """Take the scenario; nothing is started yet. The processes inherit the locks in `keeps`."""
         self._view = view
         self._scenario = scenario
         self._speed = scenario.speed or 1.0
@@ -94,14 +86,10 @@ class Rehearsal:
         self._dismiss()
 
     def run(self, done: Collection[int] = ()) -> None:
-        """Fly the episodes; each is saved as it ends.
+        """Fly the episodes that are not `done`; each is saved as it ends.
 
-        Args:
-            done: Numbers of those that need not be flown.
-
-        Raises:
-            UsageError: A process says that its input cannot be used.
-            RehearsalError: An episode was lost too often.
+        Raises UsageError if a process says that its input cannot be used, and RehearsalError if an
+        episode was lost too often.
         """
         for index, seed in enumerate(self._scenario.scenario.seeds):
             if index not in done:
@@ -315,11 +303,7 @@ class Rehearsal:
         self._observer.phase(verdict.outcome.value, verdict.time_us)
 
     def _watch_failsafe(self, pair: ProcessPair, episode: Episode) -> list[str]:
-        """The companion is gone: watch what the flight controller does, until it is down.
-
-        Returns:
-            What the autopilot said.
-        """
+        """Watch the flight controller without its companion until it is down; return its texts."""
         self._observer.waiting("companion lost: watching the failsafe land the vehicle")
         said: list[str] = []
 

@@ -1,7 +1,7 @@
-"""The folder of a run: a new one, or one that is gone on with; a kill loses no saved episode.
+"""The folder of a run: a new one, or one that is gone on with. A kill loses no saved episode.
 
 docs/run-folder.md describes every file. An episode is committed by its line in `episodes.jsonl`,
-which is written last; arrays without a line belong to an episode that never ended.
+which is written last. Arrays without a line belong to an episode that never ended.
 """
 
 from __future__ import annotations
@@ -136,18 +136,7 @@ class RunFolder:
         setup: Setup,
         seeds: Sequence[int] = (),
     ) -> RunFolder:
-        """Make the folder and write `run.json`.
-
-        Args:
-            out: The folder; None makes `runs/<UTC time>-<name>` in the working directory.
-            name: Name of the run.
-            config: Every setting: plain values, paths, pydantic models, dataclasses.
-            setup: What is flown on what.
-            seeds: Seed of each episode planned.
-
-        Raises:
-            UsageError: `out` already holds a run, or is a file.
-        """
+        """Make the folder, by default `runs/<UTC time>-<name>`, and write `run.json`."""
         now = utc_now()
         if out is None:
             path = _fresh_folder(Path("runs"), f"{now:%Y%m%dT%H%M%SZ}-{name}")
@@ -174,11 +163,7 @@ class RunFolder:
 
     @classmethod
     def adopt(cls, path: Path, info: RunInfo) -> RunFolder:
-        """Make the folder of a run that was flown elsewhere.
-
-        Raises:
-            UsageError: It cannot be made.
-        """
+        """Make the folder of a run that was flown elsewhere, or raise UsageError."""
         try:
             path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -213,10 +198,7 @@ class RunFolder:
         replace_file(path, b"".join(kept))
 
     def sweep(self) -> None:
-        """Remove what processes left behind for an episode that was never finished.
-
-        The logs of a killed firmware are kept: whole records, up to its last second.
-        """
+        """Remove what an unfinished episode's processes left, but the logs of a killed firmware."""
         for pattern in (".*.npz*", f"{LATENCY_FILE}.partial", f"{TRAJECTORIES_FILE}.partial"):
             for leftover in self.path.glob(pattern):
                 leftover.unlink()
@@ -231,10 +213,7 @@ class RunFolder:
             self.path.rmdir()
 
     def save_episodes(self, episodes: Sequence[FlownEpisode]) -> None:
-        """Save episodes; on return they are on the disk.
-
-        The arrays come first, then the lines that commit them, each with the CRC of its arrays.
-        """
+        """Save episodes: the arrays, then the lines with their CRC, which commit them."""
         groups = {f"{episode.record.index:03d}": episode for episode in episodes}
         paths = {group: episode.trajectory.arrays() for group, episode in groups.items()}
         stamps = {group: episode.latency for group, episode in groups.items()}
@@ -262,18 +241,8 @@ def open_folder(
     """Open the folder of a run: a new one, or one that holds the same run, finished or not.
 
     A run with the first ones of the seeds is the same run, and is added to. Invalid episodes, which
-    the host disturbed, are taken out of it: they are not there.
-
-    Args:
-        out: The folder; None makes a new one.
-        name: Name of a new run.
-        scenario: What is flown.
-
-    Returns:
-        The folder, and the episodes that it holds.
-
-    Raises:
-        UsageError: It holds something else, or another run.
+    the host disturbed, are taken out of it: they are not there. Return the folder and its episodes;
+    UsageError if it holds something else, or another run.
     """
     config, seeds = scenario.config, scenario.seeds
     if out is not None:
@@ -305,10 +274,7 @@ def open_folder(
 def another_config(
     held: Mapping[str, Any], asked: Mapping[str, Any], free: Collection[str] = free_fields("gym")
 ) -> str | None:
-    """Return the first setting in which two configurations differ, or None when they do not.
-
-    Settings in `free` are passed over, a table of them by its name.
-    """
+    """Return the first setting, or table of them, not in `free` that differs, or None."""
     old, new = _flat(held), _flat(json.loads(json.dumps(asked)))
     for key in sorted(old.keys() | new.keys()):
         known = key in free or key.partition(".")[0] in free
@@ -328,11 +294,7 @@ def run_info(data: Mapping[str, Any], source: object) -> RunInfo:
 
 
 def load(path: Path) -> LoadedRun:
-    """Read a run folder back; a last line cut short by a kill is passed over.
-
-    Raises:
-        UsageError: The folder holds no run, or a file of it cannot be read or is damaged.
-    """
+    """Read a run folder back, or raise UsageError; a last line cut short is passed over."""
     info = load_info(path)
     records: dict[int, EpisodeRecord] = {}
     stamp_crcs, path_crcs = {}, {}
@@ -364,15 +326,7 @@ def _write_info(path: Path, info: RunInfo) -> None:
 
 
 def _load_arrays(path: Path, crcs: Mapping[int, Any]) -> dict[int, Arrays]:
-    """Return the arrays of the episodes that have a line, by index.
-
-    Args:
-        path: The archive.
-        crcs: What each episode's line says of its arrays; None in lines of earlier versions.
-
-    Raises:
-        UsageError: The archive is damaged, or lacks or has other arrays than the lines say.
-    """
+    """Return the arrays of the episodes that have a line, by index; UsageError: damaged."""
     groups = read_groups(path)
     found = {}
     for index, crc in crcs.items():

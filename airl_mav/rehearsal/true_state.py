@@ -11,13 +11,7 @@ from firmware_sim.simulation import Simulation
 
 
 def state_of(simulation: Simulation, collision: str | None, slipped_us: int = 0) -> State:
-    """Return the state after the newest tick.
-
-    Args:
-        simulation: What is flown.
-        collision: What has been hit so far.
-        slipped_us: Simulated time given up so far [µs].
-    """
+    """Return the state after the newest tick, with what has been hit and slipped so far."""
     truth, flight = simulation.truth, simulation.autopilot.flight
     x, y, z = (float(c) for c in truth.position)
     return State(

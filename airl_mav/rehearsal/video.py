@@ -18,15 +18,7 @@ MODULE = "airl_mav.cli.video"
 
 
 def video_words(asked: Scenario, to: str) -> list[str]:
-    """Return the options of `airl video` for a rehearsal's camera.
-
-    Args:
-        asked: What is flown.
-        to: HOST:PORT of who watches.
-
-    Raises:
-        FieldError: Its camera has no address that is known beforehand.
-    """
+    """Return the options of `airl video` for a camera and a watcher; FieldError: no address."""
     if asked.level != "sitl":
         raise FieldError(
             "video", to, problem="accepted: with level sitl, whose camera has a socket"
@@ -40,10 +32,7 @@ def video_words(asked: Scenario, to: str) -> list[str]:
 
 
 def _network(asked: Scenario) -> str | None:
-    """Return where the camera's component joins the vehicle's network; None: it does not.
-
-    MAVSDK signs nothing, and other firmware has no link for devices aboard.
-    """
+    """Return where the camera joins the vehicle's network; None: unsigned, or other firmware."""
     if asked.firmware == "px4":
         return f"udpin://{LOOPBACK}:{GIMBAL_PORT + asked.real.instance}"
     if asked.firmware == "builtin" and asked.signing_key is None:

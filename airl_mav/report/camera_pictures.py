@@ -134,12 +134,9 @@ def write_png(path: Path, pixels: Pixels) -> None:
 
 
 def write_film(path: Path, pictures: Iterator[Pixels], rate_hz: float) -> int:
-    """Write an animated GIF or WebP, or a video, by the suffix; return the number of pictures.
+    """Write an animated GIF or WebP, or a video; return the number of pictures.
 
-    Raises:
-        UsageError: A video has an odd width or height.
-        OSError: The file cannot be written.
-        ImportError: Videos need PyAV: the extra `film`.
+    A video needs even sides (UsageError) and the extra `film` (ImportError).
     """
     if path.suffix.lower() == VIDEO:
         written, count = _video(pictures, period_ms(rate_hz))

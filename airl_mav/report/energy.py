@@ -164,7 +164,7 @@ def energy_figure(flights: Sequence[FlightEnergy], *, on_ground: bool = False) -
     parts = PARTS if whole else (("", "airframe", theme.SERIES), PARTS[-1])
     for name, title, colour in parts[:-1] if on_ground else parts:
         values = np.array([_joules(f, name) for f in ranked]) / 1e3
-        # What is below 0 hangs below the axis: the bar above it is longer than the energy drawn.
+        # What is below 0 hangs below the axis. The bar above it is longer than the energy drawn.
         base = np.where(values < 0.0, below, above)
         if many:
             ax.fill_between(x, base, base + values, color=colour, lw=0, step="mid", label=title)

@@ -1,7 +1,6 @@
 """The policy's inputs and choices, recomputed decision by decision from a recording.
 
-Images are rendered from the true pose at exposure, without noise, by the ray caster of the flight;
-telemetry is the recorded estimate. A learned policy is evaluated again on both.
+Images are rendered from the true pose, without noise. Telemetry is the recorded estimate.
 """
 
 from __future__ import annotations
@@ -83,11 +82,7 @@ class PolicyAgain:
 
 
 def policy_again(info: RunInfo) -> PolicyAgain | None:
-    """Return the policy of a run if it has discrete actions and its file is here unchanged.
-
-    Code from the run folder is never executed: policies that are code, or whose card names code,
-    are skipped.
-    """
+    """Return a run's policy if it has discrete actions, no code, and its file is unchanged."""
     name, digest = info.config.get("policy"), info.config.get("policy_sha256")
     if not isinstance(name, str) or digest is None or names_code(name):
         return None

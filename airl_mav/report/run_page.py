@@ -63,15 +63,7 @@ def build_page(
     vehicle: VehicleProfile | None = None,
     verdict: OverallVerdict | None = None,
 ) -> Path:
-    """Write `report.html` and its PNG files, each atomically; return the page's path.
-
-    Args:
-        run: The run.
-        arenas: Arenas by episode index; others are drawn without.
-        out: Output folder; None = the run's.
-        vehicle: The vehicle; None = less detail in energy and causes.
-        verdict: The verdict shown first.
-    """
+    """Write `report.html` and its PNG files, each atomically; return the page's path."""
     folder = out or run.path
     folder.mkdir(parents=True, exist_ok=True)
     summary = summarize_run(run)

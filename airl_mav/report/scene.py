@@ -74,14 +74,7 @@ def scene_json(
     everyone: Sequence[EpisodeRecord],
     fov_deg: float,
 ) -> str:
-    """Return all views as JSON for a script element.
-
-    Args:
-        run: The run, for the paths of `everyone`.
-        flights: Flights with a view each, in the order of the list.
-        everyone: Flights of the last, common view; omitted below two.
-        fov_deg: Horizontal field of view of the camera [deg]; 0 draws none.
-    """
+    """Return as JSON a view of each flight, and one of two or more of `everyone`."""
     top = top_speed(flights)
     views = [flight_view(flight, top, fov_deg) for flight in flights]
     if len(everyone) > 1:
@@ -220,11 +213,7 @@ def all_flights_view(
 
 
 def body_mesh(obstacles: Obstacles, i: int, center: Floats) -> tuple[Floats, NDArray[np.int64]]:
-    """Return obstacle i at a centre NED [m] as a closed mesh.
-
-    Returns:
-        Corners (n, 3), east, north, up [m], and triangles (m, 3).
-    """
+    """Return obstacle i at a centre NED as a closed mesh: corners ENU [m], triangles."""
     half, yaw = obstacles.half_size[i], float(obstacles.yaw[i])
     if obstacles.shape[i] == Shape.BOX:
         outline = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]]) * half[:2]

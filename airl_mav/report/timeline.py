@@ -42,7 +42,7 @@ SAW_DECISIONS = 16
 """With fewer decisions no saw is seen."""
 
 SAW_STEADY = 0.25
-"""Half of the decisions follow the one before within this share of the camera's period: what
+"""Half of the decisions follow the one before within this share of the camera's period. What
 scatters more has no saw."""
 
 OUTLIER_NOTE = (

@@ -56,7 +56,7 @@ COMMANDED: Mapping[str, tuple[str, ...]] = {
     ATTITUDE: ("roll_deg", "pitch_deg", "heading_deg", "thrust"),
     RATES: ("body_roll_rate_deg_s", "body_pitch_rate_deg_s", "body_yaw_rate_deg_s", "thrust"),
 }
-"""The four numbers of a setpoint by the column that they stand in: named as the fields of `Motion`,
+"""The four numbers of a setpoint by the column that they stand in. Named as the fields of `Motion`,
 and the thrust; what has no name is not shown. What ends with _deg or _deg_s is recorded in rad."""
 
 

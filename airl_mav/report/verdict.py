@@ -107,19 +107,7 @@ def judge_run(
     against: PairedComparison | None = None,
     reference: str = "",
 ) -> OverallVerdict:
-    """Return the verdict of a run.
-
-    Args:
-        setup: Policy, vehicle and computer.
-        quality: Aggregated figures.
-        episodes: The flights.
-        requirements: Requirements to check.
-        against: Comparison with a reference on the same seeds; None = none.
-        reference: Name of the reference.
-
-    Raises:
-        FieldError: A gap is required without a reference.
-    """
+    """Return the verdict of a run; FieldError if a gap is required without a reference."""
     computer = Path(setup.computer.name).stem
     rate = quality.success_rate
     reached = "no flight was finished"

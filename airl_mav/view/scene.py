@@ -109,7 +109,7 @@ class FlightScene:
 
     def _add(self, kind: str, name: str, *args: Any, **properties: Any) -> Any:
         if kind == "box":
-            # Its corners have a normal for each side: it looks the same, and a page without a GPU
+            # Its corners have a normal for each side. It looks the same, and a page without a GPU
             # has one shader fewer to compile before it shows anything.
             properties["flat_shading"] = False
         return getattr(self._scene, f"add_{kind}")(f"{self._root}{name}", *args, **properties)

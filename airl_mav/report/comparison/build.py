@@ -41,18 +41,9 @@ def compare(
     facts: Mapping[str, Any] | None = None,
     entries: Sequence[model.RunEntry] = (),
 ) -> model.Comparison:
-    """Compare runs.
+    """Compare runs, in the order of the tables, and each with the first unless contrasts are given.
 
-    Args:
-        runs: Runs by name, in the order of the tables.
-        contrasts: Names of run and reference; None = every run against the first.
-        kind: Kind of comparison; prefix of its files.
-        title: One line.
-        facts: Settings of the comparison.
-        entries: Descriptions of the runs; empty = their names only.
-
-    Raises:
-        UsageError: There is no run, a run holds no flight, or a seed twice.
+    Raises UsageError if there is no run, or one holds no flight, or a seed twice.
     """
     if not runs:
         raise UsageError(f"no run here; accepted: a {kind} of one run or more")

@@ -162,10 +162,7 @@ several runs: one for each source of latency."""
 def build_gap(
     facts: Mapping[str, Any], entries: Sequence[RunEntry], runs: Mapping[str, LoadedRun]
 ) -> Comparison:
-    """Return the gaps beside published ones, the worst seeds and the verdict.
-
-    See `show.build_comparison`. Each entry has its `role`; its `group` is the arena.
-    """
+    """Return the gaps by `role` and arena (`group`) beside published ones, and the worst seeds."""
     contrasts = [
         replace(kind, target=target.name, reference=reference.name)
         for group in dict.fromkeys(entry.group for entry in entries)

@@ -1,7 +1,4 @@
-"""Flights without a flight controller's own log as ULog, with the topics of `flight_log.topics`.
-
-Unknown fields are NaN, or 0 if they are integers.
-"""
+"""Flights as ULog, with the topics of `flight_log.topics`; unknown fields are NaN or 0."""
 
 from __future__ import annotations
 
@@ -61,11 +58,7 @@ Sample = tuple[int, str, Values]
 
 
 def write_ulog(flight: RecordedFlight, path: Path) -> None:
-    """Write a flight as ULog, replacing an existing file.
-
-    ULog times are not negative: if the vehicle's log begins before the companion, all times are
-    shifted.
-    """
+    """Write a flight as ULog, whose times are shifted if the vehicle's log begins before 0."""
     began_us = int(flight.replayed.path.time_us[0])
     later_us = max(0, -began_us)
     writer = UlogWriter(
