@@ -13,17 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from airl_mav.flight import statistics
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.quality import Quality
 from airl_mav.flight.record import EpisodeRecord
-from airl_mav.flight.statistics import (
-    MEANS,
-    NO_ESTIMATE,
-    QUANTILE,
-    Estimate,
-    bootstrap_interval,
-    median_of,
-)
 
 Floats = NDArray[np.float64]
 
@@ -58,9 +51,9 @@ class Change:
 
     reference: float | None
     other: float | None
-    difference: Estimate
+    difference: statistics.Estimate
     """Other minus reference; its n is the number of pairs behind all three figures."""
-    median: Estimate | None = None
+    median: statistics.Estimate | None = None
     """Median over the pairs of the difference of each one [%]. One long flight moves a mean, but
     not a median. None for the success rate."""
 
@@ -127,7 +120,7 @@ def common_successes(pairs: Sequence[Pair]) -> tuple[tuple[Quality, Quality], ..
     )
 
 
-def tango(gained: int, lost: int, n: int) -> Estimate:
+def tango(gained: int, lost: int, n: int) -> statistics.Estimate:
     """Return the difference of two paired proportions with Tango's 95 % score interval.
 
     The differences that McNemar's test, generalised to them, does not reject (T. Tango, Equivalence
@@ -139,7 +132,7 @@ def tango(gained: int, lost: int, n: int) -> Estimate:
     if min(gained, lost) < 0 or gained + lost > n:
         raise ValueError(f"gained={gained}, lost={lost}, n={n}: must be >= 0 and fit")
     if n == 0:
-        return NO_ESTIMATE
+        return statistics.NO_ESTIMATE
     value = (gained - lost) / n
 
     def end(limit: float) -> float:
@@ -149,13 +142,13 @@ def tango(gained: int, lost: int, n: int) -> Estimate:
         inside, outside = value, limit
         while abs(outside - inside) > TANGO_PRECISION:
             middle = 0.5 * (inside + outside)
-            if abs(_score(middle, gained, lost, n)) < QUANTILE:
+            if abs(_score(middle, gained, lost, n)) < statistics.QUANTILE:
                 inside = middle
             else:
                 outside = middle
         return 0.5 * (inside + outside)
 
-    return Estimate(value, end(-1.0), end(1.0), n)
+    return statistics.Estimate(value, end(-1.0), end(1.0), n)
 
 
 def _score(d: float, gained: int, lost: int, n: int) -> float:
@@ -170,7 +163,7 @@ def _score(d: float, gained: int, lost: int, n: int) -> float:
     return away / math.sqrt(variance) if variance > 0.0 else math.copysign(math.inf, away)
 
 
-def relative_difference(reference: ArrayLike, other: ArrayLike) -> Estimate:
+def relative_difference(reference: ArrayLike, other: ArrayLike) -> statistics.Estimate:
     """Return by how many percent the mean of paired values differs, with a bootstrap 95 % interval.
 
     Whole pairs (n,) are drawn (BCa, seeded). One pair has no interval. Pairs of one ratio have one
@@ -183,13 +176,13 @@ def relative_difference(reference: ArrayLike, other: ArrayLike) -> Estimate:
         raise ValueError("reference: must be > 0")
     n = first.size
     if n == 0:
-        return NO_ESTIMATE
+        return statistics.NO_ESTIMATE
     value = percent_change(float(first.mean()), float(second.mean()))
     if n == 1:
-        return Estimate(value, None, None, 1)
+        return statistics.Estimate(value, None, None, 1)
     if np.ptp(second / first) <= SAME_RATIO:
-        return Estimate(value, value, value, n)
-    return Estimate(value, *bootstrap_interval((first, second), _percent), n)
+        return statistics.Estimate(value, value, value, n)
+    return statistics.Estimate(value, *statistics.bootstrap_interval((first, second), _percent), n)
 
 
 def _percent(reference: Floats, other: Floats) -> Floats:
@@ -206,7 +199,7 @@ def compare_pairs(
     return PairedComparison(
         agreement=agreement,
         success_rate=_compare_rates(agreement),
-        **{name: compare_means(*_known_by_both(good, name)) for name in MEANS},
+        **{name: compare_means(*_known_by_both(good, name)) for name in statistics.MEANS},
     )
 
 
@@ -223,7 +216,7 @@ def _compare_rates(agreement: Agreement) -> Change:
     """Return both success rates and their difference in percentage points."""
     n = agreement.n
     if n == 0:
-        return Change(None, None, NO_ESTIMATE)
+        return Change(None, None, statistics.NO_ESTIMATE)
     d = tango(agreement.only_other, agreement.only_reference, n)
     return Change(
         (agreement.both + agreement.only_reference) / n,
@@ -239,17 +232,17 @@ def compare_means(reference: ArrayLike, other: ArrayLike) -> Change:
     """
     first, second = np.asarray(reference, np.float64), np.asarray(other, np.float64)
     if not first.size:
-        return Change(None, None, NO_ESTIMATE, NO_ESTIMATE)
+        return Change(None, None, statistics.NO_ESTIMATE, statistics.NO_ESTIMATE)
     means = float(first.mean()), float(second.mean())
     if not (first > 0.0).all():
-        return Change(*means, NO_ESTIMATE, NO_ESTIMATE)
+        return Change(*means, statistics.NO_ESTIMATE, statistics.NO_ESTIMATE)
     return Change(*means, relative_difference(first, second), median_ratio(first, second))
 
 
-def median_ratio(reference: ArrayLike, other: ArrayLike) -> Estimate:
+def median_ratio(reference: ArrayLike, other: ArrayLike) -> statistics.Estimate:
     """Return the median over pairs (n,) of `100 (other / reference - 1)` [%]; see `median_of`."""
     first, second = np.asarray(reference, np.float64), np.asarray(other, np.float64)
-    return median_of(100.0 * (second / first - 1.0))
+    return statistics.median_of(100.0 * (second / first - 1.0))
 
 
 def percent_change(reference: float, other: float) -> float:

@@ -11,13 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.core.constants import US_PER_S
-from airl_mav.flight.smoothness import (
-    command_steps,
-    commanded_velocity,
-    flown_velocity,
-    jerk_of,
-    sample_times,
-)
+from airl_mav.flight import smoothness
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.latency.deadlines import ages_at_effect, deadline_miss_ratio
 from airl_mav.latency.stamps import SETPOINT
@@ -134,12 +128,14 @@ def _conduct(
     hold_s: float,
 ) -> dict[str, float | None]:
     """Return the measures of deadlines and smoothness by field; arguments as `measure_quality`."""
-    times_us = sample_times(trajectory, start_us, end_us)
-    flown = jerk_of(flown_velocity(trajectory, times_us))
-    steps = command_steps(decisions)
+    times_us = smoothness.sample_times(trajectory, start_us, end_us)
+    flown = smoothness.jerk_of(smoothness.flown_velocity(trajectory, times_us))
+    steps = smoothness.command_steps(decisions)
     commanded = None
     if SETPOINT in decisions:
-        commanded = jerk_of(commanded_velocity(trajectory, decisions, times_us))
+        commanded = smoothness.jerk_of(
+            smoothness.commanded_velocity(trajectory, decisions, times_us)
+        )
     misses = None
     if hold_s > 0.0:
         misses = deadline_miss_ratio(ages_at_effect(decisions), hold_s * US_PER_S)

@@ -16,22 +16,9 @@ from typing import TYPE_CHECKING, Any
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
+from airl_mav.core import files
 from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import UsageError
-from airl_mav.core.files import (
-    CRC,
-    NO_ARRAYS,
-    Arrays,
-    add_arrays,
-    append_lines,
-    cut_torn_line,
-    read_groups,
-    read_lines,
-    read_typed,
-    replace_file,
-    typed,
-    write_json,
-)
 from airl_mav.core.log_file import PARTIAL_SUFFIX
 from airl_mav.core.provenance import describe_machine, git_state, package_versions
 from airl_mav.flight.record import SCHEMA as LINE_SCHEMA
@@ -104,7 +91,7 @@ class LoadedRun:
     path: Path
     info: RunInfo
     episodes: tuple[EpisodeRecord, ...]
-    latency: dict[int, Arrays]
+    latency: dict[int, files.Arrays]
     trajectories: dict[int, Trajectory]
 
 
@@ -175,7 +162,7 @@ class RunFolder:
     def resume(cls, path: Path) -> tuple[RunFolder, LoadedRun]:
         """Open a run that was killed, cut off a half-written line, and say what is there."""
         run = load(path)
-        cut_torn_line(path / EPISODES_FILE)
+        files.cut_torn_line(path / EPISODES_FILE)
         return cls(path), run
 
     def plan_again(self, config: Mapping[str, Any], seeds: Sequence[int]) -> None:
@@ -195,7 +182,7 @@ class RunFolder:
             for line in path.read_bytes().splitlines(keepends=True)
             if json.loads(line)["index"] not in indices
         ]
-        replace_file(path, b"".join(kept))
+        files.replace_file(path, b"".join(kept))
 
     def sweep(self) -> None:
         """Remove what an unfinished episode's processes left, but the logs of a killed firmware."""
@@ -217,13 +204,13 @@ class RunFolder:
         groups = {f"{episode.record.index:03d}": episode for episode in episodes}
         paths = {group: episode.trajectory.arrays() for group, episode in groups.items()}
         stamps = {group: episode.latency for group, episode in groups.items()}
-        path_crcs = add_arrays(self.path / TRAJECTORIES_FILE, paths)
-        stamp_crcs = add_arrays(self.path / LATENCY_FILE, stamps)
+        path_crcs = files.add_arrays(self.path / TRAJECTORIES_FILE, paths)
+        stamp_crcs = files.add_arrays(self.path / LATENCY_FILE, stamps)
         lines = [
             {**episode.record.as_data(), PATH_CRC: path_crcs[group], STAMPS_CRC: stamp_crcs[group]}
             for group, episode in groups.items()
         ]
-        append_lines(self.path / EPISODES_FILE, lines)
+        files.append_lines(self.path / EPISODES_FILE, lines)
 
 
 def check_folder(path: Path, wanted: str) -> None:
@@ -285,12 +272,12 @@ def another_config(
 
 def load_info(path: Path) -> RunInfo:
     """Read `run.json` alone. Raises UsageError."""
-    return read_typed(path / RUN_FILE, _INFO, SCHEMA, "run")
+    return files.read_typed(path / RUN_FILE, _INFO, SCHEMA, "run")
 
 
 def run_info(data: Mapping[str, Any], source: object) -> RunInfo:
     """Return what an object says, as `run.json` holds it. Raises UsageError, with the source."""
-    return typed(_INFO, data, source)
+    return files.typed(_INFO, data, source)
 
 
 def load(path: Path) -> LoadedRun:
@@ -298,7 +285,7 @@ def load(path: Path) -> LoadedRun:
     info = load_info(path)
     records: dict[int, EpisodeRecord] = {}
     stamp_crcs, path_crcs = {}, {}
-    for place, data in read_lines(path / EPISODES_FILE, LINE_SCHEMA):
+    for place, data in files.read_lines(path / EPISODES_FILE, LINE_SCHEMA):
         record = EpisodeRecord.from_data(data, place)
         # A later line replaces an earlier one. Lines of earlier versions have no CRC.
         records[record.index] = record
@@ -322,19 +309,19 @@ def info_data(info: RunInfo) -> dict[str, Any]:
 
 def _write_info(path: Path, info: RunInfo) -> None:
     """Write `run.json`."""
-    write_json(path, info_data(info))
+    files.write_json(path, info_data(info))
 
 
-def _load_arrays(path: Path, crcs: Mapping[int, Any]) -> dict[int, Arrays]:
+def _load_arrays(path: Path, crcs: Mapping[int, Any]) -> dict[int, files.Arrays]:
     """Return the arrays of the episodes that have a line, by index; UsageError: damaged."""
-    groups = read_groups(path)
+    groups = files.read_groups(path)
     found = {}
     for index, crc in crcs.items():
-        group = groups.get(f"{index:03d}", NO_ARRAYS)
+        group = groups.get(f"{index:03d}", files.NO_ARRAYS)
         if crc is not None and group.crc32 != crc:
             raise UsageError(
-                f"{path}: arrays of episode {index}: {CRC} = {group.crc32!r}: accepted: {crc!r}, "
-                f"that of {EPISODES_FILE}"
+                f"{path}: arrays of episode {index}: {files.CRC} = {group.crc32!r}: "
+                f"accepted: {crc!r}, that of {EPISODES_FILE}"
             )
         if group.arrays:
             found[index] = group.arrays
