@@ -21,12 +21,11 @@ from airl_mav.scenario.model import LimitSettings, PilotSettings, WatchdogSettin
 from airl_mav.scenario.stand_alone import Start as PilotedStart
 from companion.camera import FrameSource
 from companion.dialects import ARDUPILOT
-from companion.guard import Guard
 from companion.interfaces import CAMERA_SILENT, LINK_LOST, STOP, TELEMETRY_FROZEN, LinkError
 from companion.limits import NOT_OURS, Limits
 from companion.mavsdk_link import MavsdkLink
 from companion.pilot import FRAME_WAIT_S, WAITING, Decided, Pilot
-from companion.watchdog import Watchdog
+from companion.watchdog import Guard, Watchdog
 
 PREPARE_TIMEOUT_S = 10.0
 """How long a flight controller may be silent when a mission begins [wall s]."""

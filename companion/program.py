@@ -30,12 +30,12 @@ from airl_mav.scenario.model import LimitSettings, PilotSettings, WatchdogSettin
 from airl_mav.scenario.stand_alone import StandAloneCompanion, check_companion
 from companion.camera import FrameSource, SharedFrames
 from companion.cameras.by_name import OpenCamera, open_named_camera
-from companion.guard import ThreadGuard
 from companion.mavsdk_link import MavsdkLink
 from companion.mission import MissionResult, check_camera, fly_mission
 from companion.obstacles import obstacles_told
 from companion.presence import present
 from companion.signing_proxy import signed
+from companion.watchdog import ThreadGuard
 
 if TYPE_CHECKING:
     from companion.black_box import BlackBoxRecorder

@@ -9,7 +9,7 @@ from pydantic import Field
 from rich.console import Console
 
 from airl_mav.cli.options import POSITIONAL, check_installed
-from airl_mav.cli.recordings import folder_of
+from airl_mav.cli.shared_options import folder_of
 from airl_mav.core.console import new_console
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity

@@ -18,7 +18,7 @@ from airl_mav.camera.flow import CameraMotion
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import Motion
 from airl_mav.cli.options import POSITIONAL, check_installed
-from airl_mav.cli.recordings import folder_of
+from airl_mav.cli.shared_options import folder_of
 from airl_mav.core.console import new_console
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError

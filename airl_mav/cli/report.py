@@ -10,7 +10,7 @@ from rich.console import Console
 
 from airl_mav.black_box.messages import SUFFIX
 from airl_mav.cli.options import POSITIONAL
-from airl_mav.cli.recordings import folder_of
+from airl_mav.cli.shared_options import folder_of
 from airl_mav.core.clock import utc_now
 from airl_mav.core.console import new_console
 from airl_mav.core.errors import FieldError

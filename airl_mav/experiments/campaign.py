@@ -11,8 +11,7 @@ from pathlib import Path
 from airl_mav.core.compiling import COMPILING
 from airl_mav.core.first_start import compile_first
 from airl_mav.core.progress import Progress
-from airl_mav.experiments.executors import Executor, Stop, WorkerError, never
-from airl_mav.experiments.flier import Flier, FlyEpisodes
+from airl_mav.experiments.executors import Executor, Flier, FlyEpisodes, Stop, WorkerError, never
 from airl_mav.experiments.live import Ended
 from airl_mav.experiments.store import CampaignStore
 from airl_mav.flight.record import EpisodeRecord

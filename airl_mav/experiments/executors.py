@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Protocol, TypeVar
 
@@ -10,7 +10,9 @@ from airl_mav.core.compiling import Heard, heard_compiling
 from airl_mav.core.constants import MAX_ATTEMPTS
 from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import quantity
+from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
 from airl_mav.scenario.model import Workers
+from airl_mav.scenario.resolved import PlannedEpisode
 
 J = TypeVar("J")
 R = TypeVar("R")
@@ -150,3 +152,18 @@ def next_attempt(job: str, attempt: int, cause: str, lost: Callable[[str], None]
         raise WorkerError(f"{job}: lost {MAX_ATTEMPTS} workers, the last one by {cause}")
     lost(f"a worker was lost by {cause}: {job} begins again")
     return attempt + 1
+
+
+FlyEpisodes = Callable[[Sequence[PlannedEpisode]], Iterable[FlownEpisode]]
+
+
+class Flier(Protocol):
+    """How the episodes of a scenario are flown. Goes to workers by pickle."""
+
+    def episodes_per_job(self, episodes: int, workers: int) -> int:
+        """Return the episodes per job for executors that do not stream results."""
+        ...
+
+    def start(self, folder: RunFolder, stop: Stop) -> FlyEpisodes:
+        """Load everything once; return a function that flies episodes and polls `stop`."""
+        ...

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from airl_mav.core.constants import US_PER_S
 from airl_mav.flight import smoothness
 from airl_mav.flight.trajectory import Trajectory
-from airl_mav.latency.deadlines import ages_at_effect, deadline_miss_ratio
+from airl_mav.latency.stages import ages_at_effect, deadline_miss_ratio
 from airl_mav.latency.stamps import SETPOINT
 
 
@@ -51,7 +51,7 @@ class Quality:
     """How many such flights that is."""
     deadline_misses: float | None = None
     """Share of decisions that took effect later than the hold time after their frame was exposed,
-    or never (`latency.deadlines`), 0 to 1. None of this and the following where there is nothing
+    or never (`latency.stages`), 0 to 1. None of this and the following where there is nothing
     to work it out from, and in older records."""
     jerk_rms_m_s3: float | None = None
     """Of the flown velocity, at the bandwidth of `flight.smoothness` [m/s³]."""

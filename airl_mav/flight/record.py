@@ -84,6 +84,15 @@ class EpisodeRecord:
     """Fingerprints by lane, and of the whole `flight`; None where flights are never the same."""
     schema: int = SCHEMA
 
+    @property
+    def zero_us(self) -> int:
+        """Start of navigation, or of the episode where navigation never began [µs]."""
+        return self.started_us if self.navigation_us is None else self.navigation_us
+
+    def navigates(self, time_us: int) -> bool:
+        """Return whether the vehicle navigates at a time [µs]."""
+        return self.navigation_us is not None and (self.navigation_us <= time_us < self.ended_us)
+
     def as_data(self) -> dict[str, Any]:
         """Return the object of a line."""
         return asdict(self)

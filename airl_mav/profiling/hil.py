@@ -22,11 +22,11 @@ from airl_mav.profiling.policy_under_test import PolicyUnderTest
 from airl_mav.profiling.request import FLOWN_SPEED_M_S, ProfileRequest
 from airl_mav.rehearsal.signals import signal_handlers
 from airl_mav.scenario.stand_alone import StandAloneCompanion
-from companion.guard import ThreadGuard
 from companion.interfaces import LinkError
 from companion.mission import MissionResult, check_camera, fly_mission
 from companion.program import mission_camera, prepare
 from companion.timesync import TimesyncLink
+from companion.watchdog import ThreadGuard
 
 GOAL = 9_000.0, 0.0
 """North, east of the start [m]: out of reach."""

@@ -30,11 +30,11 @@ from airl_mav.rehearsal.channel import (
 )
 from airl_mav.scenario.resolved import ResolvedScenario
 from companion.camera import open_camera
-from companion.guard import ThreadGuard
 from companion.interfaces import LinkError
 from companion.mavsdk_link import MavsdkLink
 from companion.mission import check_camera, fly_mission
 from companion.signing_proxy import signed
+from companion.watchdog import ThreadGuard
 
 if TYPE_CHECKING:  # A companion that nobody watches need not load it.
     from airl_mav.view.taps import CompanionTap

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_MS, US_PER_S
@@ -19,12 +19,11 @@ from airl_mav.flight.quality import measure_quality
 from airl_mav.flight.record import EpisodeRecord, FaultActed
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.flight.validity import BY_HAND, host_faults, host_figures
-from airl_mav.latency.matching import match_setpoints, stamps_of
 from airl_mav.latency.stages import stage_durations
-from airl_mav.latency.stamps import SETPOINT, STAMPS, setpoint_column
+from airl_mav.latency.stamps import NO_STAMP, SETPOINT, STAMPS, setpoint_column
 from airl_mav.profiles.camera_kind import SLOW
 from airl_mav.rehearsal.channel import Ended, Loaded, State
-from airl_mav.rehearsal.process_faults import ProcessFaults
+from airl_mav.rehearsal.process_pair import ProcessFaults
 from airl_mav.rehearsal.run_folder import TICK_LATENESS, FlownEpisode
 from airl_mav.rehearsal.supervisor import Supervisor
 from airl_mav.scenario.resolved import ResolvedScenario
@@ -290,3 +289,55 @@ def part_of(
     """Return the arrays whose names begin with `prefix/`, by the rest of their names."""
     cut = 0 if keep_prefix else len(prefix) + 1
     return {k[cut:]: v for k, v in arrays.items() if k.startswith(f"{prefix}/")}
+
+
+UNMATCHED = -1
+
+SAME_WITHIN = 1e-5
+"""Setpoints closer than this in every element [m/s, rad, rad/s] are the same: MAVSDK turns degrees
+into radians in float32, which costs the last bits of a yaw."""
+
+
+def match_setpoints(
+    sent_us: ArrayLike,
+    sent_values: ArrayLike,
+    accepted_us: ArrayLike,
+    accepted_values: ArrayLike,
+) -> NDArray[np.int64]:
+    """Match each sent setpoint (n, 4) with the first accepted copy of it.
+
+    A copy counts when it was accepted at or after the sending, before the next one was sent, and
+    carries the same four numbers (NaN, an unused field, equals NaN). When a decision repeats the
+    one before, a resend of that one still under way counts as well. It commands the same. Return
+    the index (n,) into the accepted ones, `UNMATCHED` where there is none.
+    """
+    sent = np.asarray(sent_us, np.int64)
+    accepted = np.asarray(accepted_us, np.int64)
+    sent_rows = np.asarray(sent_values, np.float32).reshape(-1, 4)
+    accepted_rows = np.asarray(accepted_values, np.float32).reshape(-1, 4)
+    if len(sent) != len(sent_rows) or len(accepted) != len(accepted_rows):
+        raise ValueError(
+            f"{len(sent)} sending times for {len(sent_rows)} setpoints, "
+            f"{len(accepted)} acceptance times for {len(accepted_rows)}"
+        )
+    if np.any(np.diff(sent) < 0) or np.any(np.diff(accepted) < 0):
+        raise ValueError("times go back: sent_us and accepted_us must be in order")
+    index = np.full(len(sent), UNMATCHED, np.int64)
+    first = np.searchsorted(accepted, sent, side="left")
+    end = np.append(np.searchsorted(accepted, sent[1:], side="left"), len(accepted))
+    for i, (start, stop) in enumerate(zip(first, end, strict=False)):
+        window = accepted_rows[start:stop]
+        same = np.isclose(window, sent_rows[i], rtol=0.0, atol=SAME_WITHIN, equal_nan=True)
+        hits = np.flatnonzero(same.all(axis=1))
+        if hits.size:
+            index[i] = start + hits[0]
+    return index
+
+
+def stamps_of(index: ArrayLike, times_us: ArrayLike) -> NDArray[np.int64]:
+    """Look up the time (n,) [µs] of each match in `times_us` (m,); `NO_STAMP` where unmatched."""
+    where = np.asarray(index, np.int64)
+    stamps = np.full(len(where), NO_STAMP, np.int64)
+    matched = where != UNMATCHED
+    stamps[matched] = np.asarray(times_us, np.int64)[where[matched]]
+    return stamps

@@ -34,8 +34,7 @@ from airl_mav.rehearsal.channel import (
     Text,
     serve,
 )
-from airl_mav.rehearsal.episode_setup import episode_setup
-from airl_mav.rehearsal.true_state import state_of
+from airl_mav.rehearsal.episode_setup import episode_setup, state_of
 from airl_mav.scenario.aircraft import Aircraft
 from airl_mav.scenario.resolved import ResolvedScenario
 from firmware_sim.autopilot.autopilot_state import Message

@@ -17,12 +17,13 @@ from airl_mav.flight.judge import Referee, TruthSample, Verdict
 from airl_mav.flight.validity import BY_HAND
 from airl_mav.rehearsal import channel
 from airl_mav.rehearsal.episode import Episode, disturbances, disturbing, join_episode
-from airl_mav.rehearsal.process_faults import KILLED, ProcessFaults
 from airl_mav.rehearsal.process_pair import (
     COMPANION,
     FIRMWARE,
+    KILLED,
     REPLY_TIMEOUT_S,
     LostError,
+    ProcessFaults,
     ProcessPair,
 )
 from airl_mav.rehearsal.progress import WARNING, Observer

@@ -35,13 +35,7 @@ def estimation_table(flights: Sequence[TrackedFlight]) -> table.TableView | None
         values = np.concatenate([getattr(errors, name)[flies] for flies, errors in known])
         figures = (np.median(values), np.percentile(values, 95.0), values.max())
         rows.append((title, unit, *(f"{figure:.2f}" for figure in figures)))
-    columns = (
-        table.Column("error of the estimate", number=False),
-        table.Column("unit", number=False),
-        table.Column("median"),
-        table.Column("p95"),
-        table.Column("greatest"),
-    )
+    columns = table.columns_of("<error of the estimate | <unit | median | p95 | greatest")
     notes = (
         f"Between what the flight controller believed and the true state, 50 times a second, "
         f"{len(known):,} flights from the start of navigation.",

@@ -102,8 +102,7 @@ def still(
 def moments(flight: ReplayedFlight, rate_hz: float) -> range:
     """Return the picture times [µs] of a film, from the start of navigation to the end."""
     path, record = flight.path, flight.record
-    begin = record.started_us if record.navigation_us is None else record.navigation_us
-    begin, end = max(begin, int(path.time_us[0])), int(path.time_us[-1])
+    begin, end = max(record.zero_us, int(path.time_us[0])), int(path.time_us[-1])
     return range(begin, end + 1, period_ms(rate_hz) * US_PER_MS)
 
 

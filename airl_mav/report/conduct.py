@@ -11,15 +11,20 @@ from airl_mav.core.errors import UsageError
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.smoothness import BANDWIDTH_HZ, command_steps
 from airl_mav.flight.statistics import known, successful
-from airl_mav.latency.deadlines import deadline_miss_ratio
 from airl_mav.latency.percentiles import percentile
-from airl_mav.latency.stages import Samples
+from airl_mav.latency.stages import Samples, deadline_miss_ratio
 from airl_mav.policy.registry import find_policy
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report.arenas import vehicle_of
-from airl_mav.report.measures import COMMAND_STEP, CONDUCT, DEADLINE_MISSES, JERK, Measure
-from airl_mav.report.run_summary import RunSummary
-from airl_mav.report.table import NONE, TOO_FEW_CELL, Column, TableView
+from airl_mav.report.measures import (
+    COMMAND_STEP,
+    CONDUCT,
+    DEADLINE_MISSES,
+    JERK,
+    Measure,
+    RunSummary,
+)
+from airl_mav.report.table import NONE, TOO_FEW_CELL, TableView, columns_of
 
 CONDUCT_NOTE = (
     "Deadline misses: decisions that took effect later than the hold time after their frame was "
@@ -120,12 +125,7 @@ def conduct_table(run: LoadedRun, summary: RunSummary) -> TableView | None:
             n,
         ),
     )
-    columns = (
-        Column("measure", number=False),
-        Column("value"),
-        Column("95 % interval"),
-        Column("n"),
-    )
+    columns = columns_of("<measure | value | 95 % interval | n")
     notes = [CONDUCT_NOTE, *(() if budget is None else (budget.note,))]
     if not summary.timed:
         notes.append(

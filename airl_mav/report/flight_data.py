@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from airl_mav.camera.frame import rgb_of
 from airl_mav.core.constants import US_PER_MS
 from airl_mav.core.files import Arrays
-from airl_mav.latency.series import decision_series
-from airl_mav.latency.stages import STAGES
+from airl_mav.latency.stages import STAGES, decision_series
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.report.depth_colours import shades
 from airl_mav.report.policy_view import PolicyAgain, SeenDecision

@@ -27,9 +27,8 @@ from airl_mav.report.faults import faults_table
 from airl_mav.report.flight_data import BEST, packed
 from airl_mav.report.flights_above import overview_picture
 from airl_mav.report.forensics.worst import causes_table, examine_worst, worst_table
-from airl_mav.report.measures import rate_digits
+from airl_mav.report.measures import RunSummary, rate_digits, summarize_run
 from airl_mav.report.run_figures import latency_figure
-from airl_mav.report.run_summary import RunSummary, summarize_run
 from airl_mav.report.scene import ALL_FLIGHTS, plotly_script
 from airl_mav.report.shown_flights import (
     ShownFlights,

@@ -28,9 +28,9 @@ from airl_mav.report.measures import (
     PACK,
     SUCCESS_RATE,
     Measure,
+    RunSummary,
     rate_digits,
 )
-from airl_mav.report.run_summary import RunSummary
 
 BYTES_PER_MIB = 1 << 20
 
@@ -101,18 +101,12 @@ def episodes_table(run: LoadedRun, most: int | None = None) -> table.TableView:
     """Return the quality of each flight, or of at most so many, those that failed first."""
     feeds = not run.info.setup.computer_on_ground
     columns = (
-        table.Column("#"),
-        table.Column("seed"),
-        table.Column("outcome", number=False),
-        table.Column("time", "s"),
-        table.Column("distance", "m"),
-        table.Column("energy", "kJ"),
-        table.Column("speed", "m/s"),
-        table.Column("top speed", "m/s", page_only=True),
+        *table.columns_of(
+            "# | seed | <outcome | time [s] | distance [m] | "
+            "energy [kJ] | speed [m/s] | *top speed [m/s]"
+        ),
         *([table.Column("computer", "J", page_only=True)] if feeds else []),
-        table.Column("take-off", "s, kJ", page_only=True),
-        table.Column("battery", "%", page_only=True),
-        table.Column("why", number=False, page_only=True),
+        *table.columns_of("*take-off [s, kJ] | *battery [%] | *<why"),
     )
     total = len(run.episodes)
     shown = run.episodes if most is None else failures_first(run.episodes, most)
@@ -155,14 +149,7 @@ def _kilojoules(joules: float | None) -> str:
 
 def quality_table(summary: RunSummary, *, computer: bool = True) -> table.TableView:
     """Return the flight quality with intervals; `computer` = its energy is the vehicle's."""
-    columns = (
-        table.Column("measure", number=False),
-        table.Column("value"),
-        table.Column("95 % interval"),
-        table.Column("median"),
-        table.Column("95 % interval", page_only=True),
-        table.Column("n"),
-    )
+    columns = table.columns_of("<measure | value | 95 % interval | median | *95 % interval | n")
     q = summary.quality
     rate = replace(SUCCESS_RATE, digits=rate_digits(q.success_rate))
     measures = [rate, FLIGHT_TIME, DISTANCE, ENERGY]
@@ -202,7 +189,7 @@ def _estimate_row(measure: Measure, mean: Estimate, median: Estimate) -> tuple[s
 
 def real_time_table(run: LoadedRun, summary: RunSummary) -> table.TableView:
     """Return real-time pace and the companion's resource use."""
-    columns = (table.Column("measure", number=False), table.Column("value"), table.Column("n"))
+    columns = table.columns_of("<measure | value | n")
     nothing: NDArray[np.int64] = np.zeros(0, np.int64)
     lateness = [stamps.get(TICK_LATENESS, nothing) for stamps in run.latency.values()]
     accepted = [stamps["accepted_us"] for stamps in run.latency.values() if "accepted_us" in stamps]

@@ -163,7 +163,7 @@ def flight_view(flight: SceneFlight, top: float, fov_deg: float) -> dict[str, An
             "marker": {"size": [0, 7, 0], "color": "#2f7fc4"},
         },
     ]
-    since_us = 0 if record.navigation_us is None else record.navigation_us - record.started_us
+    since_us = record.zero_us - record.started_us
     return {
         "figure": {"data": traces, "layout": _layout()},
         "path": {

@@ -25,9 +25,9 @@ from airl_mav.report.conduct import conduct_table
 from airl_mav.report.energy import energy_flights_table, energy_table, flight_energies
 from airl_mav.report.flight_data import unpacked
 from airl_mav.report.forensics.worst import examine_worst
+from airl_mav.report.measures import summarize_run
 from airl_mav.report.run_page import build_page
 from airl_mav.report.run_report import print_report, verdict_of
-from airl_mav.report.run_summary import summarize_run
 from airl_mav.report.run_tables import (
     episodes_table,
     latency_table,

@@ -22,8 +22,8 @@ from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape, Tour
 from airl_mav.cli.evaluate import EvaluateOptions
 from airl_mav.cli.evaluate import run as evaluate
 from airl_mav.cli.options import check_installed, read_options
+from airl_mav.cli.shared_options import view_of
 from airl_mav.cli.sitl import SitlOptions
-from airl_mav.cli.viewing import view_of
 from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import CommandKind
 from airl_mav.core.errors import FieldError, UsageError

@@ -189,7 +189,7 @@ def _commanded(flight: RecordedFlight, interval_us: int) -> Iterator[tuple[int, 
     which = np.searchsorted(flight.decisions["sent_us"], path.time_us, side="right") - 1
     for i in _every(path, interval_us):
         time_us = int(path.time_us[i])
-        if which[i] >= 0 and flight.navigates(time_us):
+        if which[i] >= 0 and flight.replayed.record.navigates(time_us):
             yield time_us, int(which[i])
 
 
@@ -215,7 +215,7 @@ def _states(flight: RecordedFlight, path: Trajectory) -> Iterator[Sample]:
     """Give who flies and whether it flies, when that changes and every half second."""
     last, due_us = None, 0
     for time_us, position in zip(path.time_us.tolist(), path.position, strict=True):
-        navigates = flight.navigates(time_us)
+        navigates = flight.replayed.record.navigates(time_us)
         flies = navigates or -float(position[2]) > STANDING_M
         if (navigates, flies) == last and time_us < due_us:
             continue
