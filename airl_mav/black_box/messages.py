@@ -72,16 +72,9 @@ class Telemetry:
 
 
 @dataclass(frozen=True)
-class Truth:
+class Truth(Telemetry):
     """What the simulator knows of the vehicle; in files that are exported from a run."""
 
-    time_us: Microseconds
-    position: Vector3
-    """[m]."""
-    velocity: Vector3
-    """[m/s]."""
-    quaternion: Vector4
-    """w, x, y, z, body to world."""
     power_w: Number
     """Electrical power, without the companion computer's."""
 

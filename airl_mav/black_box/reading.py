@@ -16,21 +16,7 @@ from mcap.stream_reader import CRCValidationError, StreamReader
 from pydantic import TypeAdapter, ValidationError
 
 from airl_mav.black_box.channels import JSON
-from airl_mav.black_box.messages import (
-    TOPICS,
-    Command,
-    Decision,
-    End,
-    Latency,
-    Log,
-    Message,
-    Phase,
-    RawImage,
-    Resources,
-    Status,
-    Telemetry,
-    Truth,
-)
+from airl_mav.black_box.messages import TOPICS, Message
 from airl_mav.black_box.writing import METADATA, RUN
 from airl_mav.core.errors import UsageError
 
@@ -40,20 +26,7 @@ _RECORD_BYTES = 64 * 2**20
 _TORN = (McapError, struct.error, UnicodeDecodeError, ValidationError)
 """What a file that ends in the midst of a record, or is damaged there, leads to."""
 
-M = TypeVar(
-    "M",
-    Decision,
-    Telemetry,
-    Truth,
-    Command,
-    Latency,
-    Status,
-    Resources,
-    Phase,
-    End,
-    RawImage,
-    Log,
-)
+M = TypeVar("M", bound=Message)
 
 
 @dataclass

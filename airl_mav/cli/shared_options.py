@@ -19,6 +19,14 @@ if TYPE_CHECKING:
     from airl_mav.report.verdict import OverallVerdict
 
 
+TrustArenas = Annotated[
+    bool,
+    Field(
+        description="run the arena generators that the runs name: code of whoever made the folder"
+    ),
+]
+
+
 class Gate(ProfileModel):
     """Requirements, and files that say whether they are met."""
 

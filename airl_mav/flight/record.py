@@ -9,6 +9,7 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
+from airl_mav.core.constants import US_PER_S
 from airl_mav.core.files import typed
 from airl_mav.core.goals import Goal
 from airl_mav.core.process_use import ProcessUse
@@ -92,6 +93,13 @@ class EpisodeRecord:
     def navigates(self, time_us: int) -> bool:
         """Return whether the vehicle navigates at a time [µs]."""
         return self.navigation_us is not None and (self.navigation_us <= time_us < self.ended_us)
+
+    def fault_spans_s(self) -> list[tuple[float, float]]:
+        """Return from when to when each fault acted [s], as time counts from `zero_us`."""
+        return [
+            ((each.from_us - self.zero_us) / US_PER_S, (each.to_us - self.zero_us) / US_PER_S)
+            for each in self.faults
+        ]
 
     def as_data(self) -> dict[str, Any]:
         """Return the object of a line."""

@@ -40,8 +40,3 @@ def integrated_time(samples: ArrayLike) -> float:
     times = 1.0 + 2.0 * np.cumsum(autocorrelation(values, most)[1:])
     wide = np.flatnonzero(np.arange(1, most + 1) >= WINDOW * times)
     return float(times[wide[0]] if wide.size else times[-1])
-
-
-def independent_below(n: int) -> float:
-    """Return the size that the autocorrelation of n independent samples keeps below in 95 %."""
-    return float(1.96 / np.sqrt(n))

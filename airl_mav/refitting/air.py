@@ -25,7 +25,7 @@ wind is wide where the flight is short, or the drag small.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +35,7 @@ from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S
 from airl_mav.latency.autocorrelation import integrated_time
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.refitting.flown import Flown
-from airl_mav.refitting.quantity import Array, FittedQuantity, unobserved
+from airl_mav.refitting.quantity import Array, FittedQuantity
 from airl_mav.vehicle_log.ulog import VehicleLog
 
 WINDOW = 13
@@ -82,6 +82,13 @@ ITERATIONS = 4
 _DRAG, _NORTH, _EAST = 0, 1, 2
 _AIR = 3
 """Parameters of the air: k, k w north, k w east; biases follow."""
+
+
+DRAG = FittedQuantity("drag_1_s", "drag per mass", "1/s")
+WIND = (
+    FittedQuantity("wind_north_m_s", "wind towards north", "m/s"),
+    FittedQuantity("wind_east_m_s", "wind towards east", "m/s"),
+)
 
 
 @dataclass(frozen=True)
@@ -145,9 +152,7 @@ def fit_air(flown: Flown, vehicle: VehicleProfile, rng: np.random.Generator) -> 
         return _nothing("the flight is too short", known, quadratic_1_m)
     middle, covariance = _posterior(rows, quadratic_1_m)
     drawn = rng.multivariate_normal(middle[:_AIR], covariance[:_AIR, :_AIR], DRAWS)
-    drag = _estimate(
-        "drag_1_s", "drag per mass", "1/s", middle[_DRAG], drawn[:, _DRAG], source, known
-    )
+    drag = _estimate(replace(DRAG, profile=known), middle[_DRAG], drawn[:, _DRAG], source)
     half = drag.half_width or 0.0
     if middle[_DRAG] <= 0.0 or half > WIDEST_DRAG * middle[_DRAG]:
         why = (
@@ -156,43 +161,26 @@ def fit_air(flown: Flown, vehicle: VehicleProfile, rng: np.random.Generator) -> 
         )
         return _nothing(why, known, quadratic_1_m)
     wind = [
-        _estimate(key, meaning, "m/s", middle[i] / middle[_DRAG], drawn[:, i] / drawn[:, 0], source)
-        for i, key, meaning in (
-            (_NORTH, "wind_north_m_s", "wind towards north"),
-            (_EAST, "wind_east_m_s", "wind towards east"),
-        )
+        _estimate(of, middle[i] / middle[_DRAG], drawn[:, i] / drawn[:, _DRAG], source)
+        for of, i in zip(WIND, (_NORTH, _EAST), strict=True)
     ]
     if (half := max(each.half_width or 0.0 for each in wind)) > WIDEST_WIND_M_S:
         why = (
             f"known to {half:.1f} m/s, {WIDEST_WIND_M_S:g} or better is needed: against this drag"
             " an error of the attitude looks like it"
         )
-        wind = [unobserved(each.key, each.meaning, each.unit, why, None) for each in wind]
+        wind = [each.without(why) for each in WIND]
     return Air(drag, wind[0], wind[1], quadratic_1_m)
 
 
 def _nothing(why: str, known: float, quadratic_1_m: float) -> Air:
-    return Air(
-        unobserved("drag_1_s", "drag per mass", "1/s", why, known),
-        unobserved("wind_north_m_s", "wind towards north", "m/s", why, None),
-        unobserved("wind_east_m_s", "wind towards east", "m/s", why, None),
-        quadratic_1_m,
-    )
+    north, east = WIND
+    drag = replace(DRAG, profile=known)
+    return Air(drag.without(why), north.without(why), east.without(why), quadratic_1_m)
 
 
-def _estimate(
-    key: str,
-    meaning: str,
-    unit: str,
-    value: float,
-    drawn: Array,
-    source: str,
-    profile: float | None = None,
-) -> FittedQuantity:
-    low, high = np.quantile(drawn, (0.025, 0.975))
-    return FittedQuantity(
-        key, meaning, unit, float(value), float(low), float(high), source, "", profile
-    )
+def _estimate(of: FittedQuantity, value: float, drawn: Array, source: str) -> FittedQuantity:
+    return of.found(value, *np.quantile(drawn, (0.025, 0.975)), source)
 
 
 def _felt_rows(flown: Flown, bias_m_s2: float) -> _Rows | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,7 @@ class FittedQuantity:
     key: str
     meaning: str
     unit: str
-    value: float | None
+    value: float | None = None
     """None: not observable in this flight."""
     low: float | None = None
     high: float | None = None
@@ -51,12 +51,13 @@ class FittedQuantity:
             return None
         return 0.5 * (self.high - self.low)
 
+    def found(self, value: float, low: float, high: float, source: str) -> FittedQuantity:
+        """Return it with a value, its interval and their source."""
+        return replace(self, value=float(value), low=float(low), high=float(high), source=source)
 
-def unobserved(
-    key: str, meaning: str, unit: str, why: str, profile: float | None
-) -> FittedQuantity:
-    """Return a quantity that the flight does not tell, and why."""
-    return FittedQuantity(key, meaning, unit, None, unobservable=why, profile=profile)
+    def without(self, why: str) -> FittedQuantity:
+        """Return it as not observable."""
+        return replace(self, value=None, low=None, high=None, source="", unobservable=why)
 
 
 def block_intervals(

@@ -38,11 +38,6 @@ def packed(text: str) -> str:
     return base64.b64encode(gzip.compress(text.encode(), compresslevel=LEVEL, mtime=0)).decode()
 
 
-def unpacked(data: str) -> str:
-    """Return the text that `packed` was given."""
-    return gzip.decompress(base64.b64decode(data)).decode()
-
-
 def steps_of(values: NDArray[np.float64] | Sequence[float], unit: float) -> Steps:
     """Return numbers (n,), all finite, as steps of a unit: each is kept to half a unit."""
     whole = np.round(np.asarray(values, np.float64) / unit).astype(np.int64)

@@ -18,8 +18,8 @@ from airl_mav.report import run_tables
 from airl_mav.report.arenas import arenas_of, vehicle_of
 from airl_mav.report.conduct import conduct_table
 from airl_mav.report.document import print_place, print_verdict
-from airl_mav.report.faults import faults_table
 from airl_mav.report.measures import summarize_run
+from airl_mav.report.run_tables import faults_table
 from airl_mav.report.table import count_outcomes, print_facts, print_table
 from airl_mav.report.verdict import (
     OverallVerdict,

@@ -26,7 +26,7 @@ from airl_mav.report.forensics.camera_view import headings
 from airl_mav.report.forensics.worst import flown_path
 from airl_mav.report.run_figures import OUTCOME_COLOURS, speed_colours
 from airl_mav.report.table import OUTCOME_LABELS
-from airl_mav.view.look import GLASS_OPACITY
+from airl_mav.view.style import GLASS_OPACITY
 
 POINTS = 240
 """A path has at most this many points: one a tenth of a second, or what is seen of more."""

@@ -614,7 +614,7 @@ def test_hills_are_told_and_shown_as_they_are() -> None:
 
 def test_walls_are_seen_from_inside() -> None:
     pytest.importorskip("viser")
-    from airl_mav.view.look import walls
+    from airl_mav.view.style import walls
 
     inside = np.array([10.0, 0.0, -2.0])
     for ceiling, count in ((False, 8), (True, 10)):

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from airl_mav.flight.record import EpisodeRecord, run_sha256
 from airl_mav.flight.statistics import aggregate
 from airl_mav.latency.percentiles import summarize
 from airl_mav.latency.stages import ALL_STAGES, Samples, pool, stage_samples
-from airl_mav.rehearsal.run_folder import LoadedRun, load
+from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report.comparison import model
 from airl_mav.report.run_tables import setup_rows
 
@@ -69,11 +68,6 @@ def compare(
         runs=compared,
         contrasts=tuple(_contrast(entry, runs, figures) for entry in contrasts),
     )
-
-
-def load_runs(folder: Path, entries: Iterable[model.RunEntry]) -> dict[str, LoadedRun]:
-    """Read the runs of a comparison that lies in a folder, by name. Raises UsageError."""
-    return {entry.name: load(folder / entry.folder) for entry in entries}
 
 
 def tests_of(run: LoadedRun) -> list[EpisodeRecord]:

@@ -13,9 +13,8 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.progress import DRAWING, Progress
 from airl_mav.flight.requirements import Requirement, find, settle
 from airl_mav.flight.statistics import reached_goals
-from airl_mav.rehearsal.run_folder import LoadedRun
+from airl_mav.rehearsal.run_folder import LoadedRun, load
 from airl_mav.report.comparison import degradation, gap, ladder, matrix, model, runs
-from airl_mav.report.comparison.build import load_runs
 from airl_mav.report.document import Document, print_document, print_place, write_document
 from airl_mav.report.verdict import (
     OverallVerdict,
@@ -56,7 +55,7 @@ def build_comparison(
     folder: Path, kind: model.Kind, facts: Mapping[str, Any], entries: Sequence[model.RunEntry]
 ) -> tuple[model.Comparison, dict[str, LoadedRun]]:
     """Read the runs of a folder and compare them; the kind's module documents its facts."""
-    loaded = load_runs(folder, entries)
+    loaded = {entry.name: load(folder / entry.folder) for entry in entries}
     return _BUILD[kind](facts, entries, loaded), loaded
 
 

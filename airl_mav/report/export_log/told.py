@@ -55,9 +55,9 @@ from airl_mav.report.export_log.scene import (
 from airl_mav.report.forensics.camera_view import PolicyCamera
 from airl_mav.report.recorded_flight import NAVIGATING
 from airl_mav.report.replay.flight import STANDING_M
-from airl_mav.view.look import FIRST, OTHER
 from airl_mav.view.messages import VehicleShape
 from airl_mav.view.shown import OFFBOARD
+from airl_mav.view.style import FIRST, OTHER
 
 ENDED = "ended"
 """The phase after navigation."""

@@ -13,10 +13,10 @@ from airl_mav.core.errors import UsageError
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.report.replay.flight import ReplayedFlight, parting_s
 from airl_mav.report.replay.runs import ReplayedRun, ReplayedRuns
-from airl_mav.view.look import OTHER
 from airl_mav.view.panel import Panel
 from airl_mav.view.scene import FlightScene
 from airl_mav.view.shown import Shown
+from airl_mav.view.style import OTHER
 from airl_mav.view.watchers import Watchers
 
 DRAW_US = 33_000
