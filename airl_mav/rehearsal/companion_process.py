@@ -17,17 +17,7 @@ from airl_mav.core.errors import EXIT_BROKEN
 from airl_mav.core.files import save_arrays
 from airl_mav.core.ports import LOOPBACK
 from airl_mav.core.process_use import UseMeter
-from airl_mav.rehearsal.channel import (
-    Abort,
-    Begin,
-    ChildChannel,
-    Ended,
-    Fly,
-    Progress,
-    Ready,
-    Shutdown,
-    serve,
-)
+from airl_mav.rehearsal import channel
 from airl_mav.scenario.resolved import ResolvedScenario
 from companion.camera import open_camera
 from companion.interfaces import LinkError
@@ -47,23 +37,26 @@ class Missions:
     """Flies missions; link and camera stay open for all of them."""
 
     def __init__(
-        self, scenario: ResolvedScenario, channel: ChildChannel, tap: CompanionTap | None = None
+        self,
+        scenario: ResolvedScenario,
+        harness: channel.ChildChannel,
+        tap: CompanionTap | None = None,
     ) -> None:
         """Load the policy, or raise UsageError; nothing is connected yet."""
         self._scenario = scenario
         self._tap = tap
-        self._channel = channel
+        self._harness = harness
         self._clock = WallClock(scenario.speed or 1.0)
         self._requests: queue.Queue[Any] = queue.Queue()
         self._stop, self._abandon = threading.Event(), threading.Event()
 
     def handle(self, request: Any) -> None:
         """Take a request, on the channel's thread."""
-        if isinstance(request, Abort):
+        if isinstance(request, channel.Abort):
             (self._stop if request.land else self._abandon).set()
             self._stop.set()
             return
-        if isinstance(request, Fly):
+        if isinstance(request, channel.Fly):
             self._stop.clear()
             self._abandon.clear()
             # Shared for one flight, then left alone. What lasts a while (holding an action, the
@@ -86,8 +79,8 @@ class Missions:
             signed(f"udpin://{LOOPBACK}:{aircraft.companion_port}", aircraft.signing_key) as url,
             closing(MavsdkLink(url, clock, self._abandon)) as link,
         ):
-            self._channel.send(Ready())
-            while not isinstance(request := self._requests.get(), Shutdown):
+            self._harness.send(channel.Ready())
+            while not isinstance(request := self._requests.get(), channel.Shutdown):
                 if not link.connected:
                     link.connect(CONNECT_TIMEOUT_S)
                 policy = self._scenario.fresh_policy(request.seed)
@@ -121,8 +114,8 @@ class Missions:
                 )
                 used = use.end()
                 save_arrays(Path(request.record), result.log.columns())
-                self._channel.send(
-                    Ended(
+                self._harness.send(
+                    channel.Ended(
                         reason=result.reason,
                         notes=result.notes,
                         path=request.record,
@@ -132,10 +125,10 @@ class Missions:
                 )
 
     def _announce(self, phase: str) -> None:
-        self._channel.send(Progress(phase=phase, time_us=self._clock.time_us()))
+        self._harness.send(channel.Progress(phase=phase, time_us=self._clock.time_us()))
 
 
-def fly(begin: Begin, channel: ChildChannel) -> None:
+def fly(begin: channel.Begin, harness: channel.ChildChannel) -> None:
     """Fly missions on request, until the pipe ends."""
     with ExitStack() as held:
         tap: CompanionTap | None = None
@@ -143,12 +136,12 @@ def fly(begin: Begin, channel: ChildChannel) -> None:
             from airl_mav.view.taps import CompanionTap
 
             tap = held.enter_context(closing(CompanionTap(begin.view, begin.scenario)))
-        missions = Missions(begin.scenario, channel, tap)
+        missions = Missions(begin.scenario, harness, tap)
         # Without its rehearsal a companion has no business in the air, whatever it is doing: its
         # setpoints end and the flight controller's offboard-loss failsafe takes over.
-        channel.listen(missions.handle, lambda: os._exit(EXIT_BROKEN))
+        harness.listen(missions.handle, lambda: os._exit(EXIT_BROKEN))
         missions.run()
 
 
 if __name__ == "__main__":
-    sys.exit(serve(fly, LinkError))
+    sys.exit(channel.serve(fly, LinkError))
