@@ -199,10 +199,9 @@ def fly_alone(
     waiting: Callable[[], None],
     progress: Callable[[str, int], None],
 ) -> MissionResult:
-    """Fly one mission with a real flight controller; `stop` lands, `abandon` ends without landing.
+    """Fly one mission with a real flight controller; `stop` lands, `abandon` does not.
 
-    `waiting` is called before waiting for the flight controller. Raises UsageError for an unusable
-    address or camera, and LinkError.
+    `waiting` is called before waiting for the flight controller. Raises UsageError or LinkError.
     """
     clock = WallClock(asked.speed)
 

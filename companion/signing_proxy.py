@@ -46,10 +46,7 @@ class SigningProxy:
     """Passes a flight controller's verified frames to MAVSDK, and MAVSDK's, signed, back."""
 
     def __init__(self, url: str, key: Path) -> None:
-        """Bind and start the proxy of udpin://HOST:PORT, or raise UsageError.
-
-        Without a host only this machine can reach it (0.0.0.0: all in its networks).
-        """
+        """Bind and start the proxy of udpin://HOST:PORT, of this machine without a host."""
         found = _URL.fullmatch(url)
         if found is None:
             raise UsageError(f"--connect {url}: with a signing key: udpin://HOST:PORT")

@@ -42,10 +42,7 @@ class Watcher(NamedTuple):
 
 
 def picture_of(frame: Frame | FurtherImage, range_m: float) -> NDArray[np.uint8]:
-    """Return an image as a picture (h, w, 3) of even sides, at least `LEAST_PX` wide.
-
-    Depth up to `range_m` [m] is grey: near is bright, no return is black.
-    """
+    """Return an image as a picture (h, w, 3) of even sides; near is bright, no return black."""
     if frame.intrinsics.kind == "depth":
         shade = DARKEST + (255.0 - DARKEST) * nearness(frame.image, range_m)
         grey = np.where(frame.image == 0, 0.0, shade).astype(np.uint8)

@@ -70,10 +70,7 @@ def fly_and_show(
     gate: Gate = NOTHING_REQUIRED,
     telling: Telling = FOR_PEOPLE,
 ) -> tuple[int, ExperimentRun]:
-    """Fly the rest of an experiment and show the comparison; return exit status and what was flown.
-
-    The status is 0, 1 (workers lost), 3 to 5 (verdict) or 130 (Ctrl-C).
-    """
+    """Fly the rest of an experiment and show it; return 0, 1, 3 to 5 or 130, and what flew."""
     # Imported here and below: options need no simulator, and no flight waits for figures.
     from airl_mav.experiments.experiment import run_experiment
     from airl_mav.experiments.live import EXIT_CODES

@@ -53,10 +53,7 @@ class Vehicle:
     """One vehicle, observed and commanded."""
 
     def __init__(self, url: str, speed: float, transcript: Transcript) -> None:
-        """Open a MAVSDK connection. Raises UsageError if its URL is invalid or its port taken.
-
-        `speed` is the simulated seconds per wall second of the vehicle.
-        """
+        """Open a MAVSDK connection to a vehicle of some speed, or raise UsageError."""
         self.url, self.speed = url, speed
         self.transcript = transcript
         self.telemetry = telemetry.Telemetry(transcript)

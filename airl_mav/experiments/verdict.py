@@ -52,11 +52,7 @@ def seek_verdict(
     out: Path | None = None,
     progress: Progress,
 ) -> SoughtVerdict:
-    """Fly a policy on its onboard computer until its success rate is decided, then the reference.
-
-    At least one requirement is a minimum success rate. UsageError: it cannot be flown, or the
-    folder holds another verdict's flights.
-    """
+    """Fly a policy on its onboard computer until it is decided, then the reference."""
     tests = [each.test() for each in requirements if each.least_rate]
     if not tests:
         raise FieldError("require", accepted="at least one least success rate: 'success >= 95 %'")

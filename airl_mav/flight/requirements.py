@@ -148,10 +148,7 @@ def parse_requirement(text: str) -> Requirement:
 
 
 def find(requirement: Requirement, quality: Aggregate, against: PairedComparison | None) -> Finding:
-    """Judge a requirement by the flights of a run, a gap against its reference on the same seeds.
-
-    Raises FieldError if a gap is required, and there is no reference.
-    """
+    """Judge a requirement by a run, a gap against its reference; FieldError without any."""
     measure = MEASURES[requirement.measure]
     if requirement.gap:
         if against is None:

@@ -119,10 +119,7 @@ def host_figures(
 
 
 def host_faults(figures: HostFigures, strangers: Sequence[str] = ()) -> tuple[str, ...]:
-    """Return why a flight is no test of its policy; empty: it is one.
-
-    Strangers are who commanded the vehicle without being its companion or a ground station.
-    """
+    """Return why a flight is no test of its policy; `strangers` commanded the vehicle."""
     faults = []
     for rule in RULES:
         value = getattr(figures, rule.figure)
@@ -151,10 +148,7 @@ def _share_beyond(
     limit_us: float,
     excused: Sequence[tuple[int, int]],
 ) -> float | None:
-    """Return the share of intervals longer than a limit; None where there is none.
-
-    Those that any of the excused times falls into are not counted.
-    """
+    """Return the share of intervals longer than a limit, excused times aside; None: none."""
     if start not in stamps or end not in stamps:
         return None
     first, last = stamps[start], stamps[end]

@@ -45,11 +45,7 @@ def select_injection(
     policy_sha256: str | None = None,
     macs: int | None = None,
 ) -> Injection:
-    """Choose the latency that a policy flies with: a source written as text, or a computer.
-
-    Arguments as of `choose_injection`. Raises UsageError if there is no such source, computer or
-    workload, or both are given.
-    """
+    """Choose a flight's latency, by a source as text or a computer, or raise UsageError."""
     if source is None:
         return choose_injection(computer, workload, policy_sha256=policy_sha256, macs=macs)
     if workload is not None:

@@ -166,10 +166,7 @@ class LogLost(_Line):
 
 
 class Due(_Line):
-    """A fault of a process begins or ends now: the rehearsal carries it out.
-
-    The firmware has saved the episode's arrays, as at `FinishEpisode`, when it is to be killed.
-    """
+    """A process's fault begins or ends; a firmware to be killed has saved its arrays."""
 
     type: Literal["due"] = "due"
     time_us: int

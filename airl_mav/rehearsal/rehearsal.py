@@ -72,11 +72,7 @@ class Rehearsal:
         self._dismiss()
 
     def run(self, done: Collection[int] = ()) -> None:
-        """Fly the episodes that are not `done`; each is saved as it ends.
-
-        Raises UsageError if a process says that its input cannot be used, and RehearsalError if an
-        episode was lost too often.
-        """
+        """Fly the episodes that are not `done` and save each; RehearsalError: lost too often."""
         for index, seed in enumerate(self._scenario.scenario.seeds):
             if index not in done:
                 self._fly_surely(index, seed)

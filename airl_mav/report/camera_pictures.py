@@ -85,11 +85,7 @@ def still(
     rays: int,
     range_m: float,
 ) -> Pixels:
-    """Return a ray-cast picture; arguments as of `render.render`, `range_m` is drawn darkest.
-
-    `show` is its content, except flow (see `report.ground_truth`), `rays` the number per pixel and
-    axis for rgb and grey.
-    """
+    """Return a ray-cast picture of anything but flow, with `rays` a pixel for colours."""
     if show in ("rgb", "grey"):
         rgb = antialiased(arena, centers, camera, position, quaternion, rays)
         return rgb if show == "rgb" else grey(rgb)

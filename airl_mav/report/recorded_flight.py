@@ -78,10 +78,7 @@ def info_of(box: BlackBox, digest: str = "") -> RunInfo:
 def episode_of(
     box: BlackBox, path: Trajectory | None = None, remarks: tuple[str, ...] = ()
 ) -> FlownEpisode:
-    """Return the flight of a black box; UsageError without its settings.
-
-    A `path` is more accurate than the flight controller's telemetry; `remarks` come first.
-    """
+    """Return the flight of a black box, or UsageError; a `path` replaces its telemetry."""
     asked = settings_of(box)
     path = path_of(box) if path is None else path
     stamps = stamps_of(box)

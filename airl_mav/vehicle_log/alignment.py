@@ -82,11 +82,7 @@ def align(
     setpoints: NDArray[np.float64],
     commands: CommandKind = "velocity",
 ) -> Alignment:
-    """Return the relation of the clocks of a recorded flight and of its vehicle's log.
-
-    `path` is telemetry, by the companion's clock. Raises UsageError if the log is of another
-    flight, or nothing moved.
-    """
+    """Return how a recorded flight's clock and its vehicle's log relate, or raise UsageError."""
     told_us = _refined(path, log, _coarse(path, log))
     flown, logged = path.velocity[:, :2], log.motion.at(path.time_us - told_us)[:, 3:5]
     inside = _inside(path, log, told_us)

@@ -164,10 +164,7 @@ def _places(
     lens_centre: float,
     points: int,
 ) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Return the nearest lens pixel of each point along an axis (size x points,), and misses.
-
-    For a pinhole in a pinhole, where rows and columns are separable.
-    """
+    """Return the nearest lens pixels along an axis of a pinhole (size x points,), and misses."""
     at = (np.arange(size * points) + 0.5) / points - 0.5
     place = np.rint(lens_centre + lens_focal * (at - centre) / focal).astype(np.intp)
     return np.clip(place, 0, lens_size - 1), (place < 0) | (place >= lens_size)

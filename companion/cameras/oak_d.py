@@ -103,10 +103,7 @@ class OakD:
 
 
 def _lens_of(frame: Any) -> Lens:
-    """Return the lens of an image as depthai's own point-cloud nodes use it, or raise ValueError.
-
-    Intrinsics follow the image through rectification and scaling; rectified images are undistorted.
-    """
+    """Return an image's lens, as depthai's point-cloud nodes use it, or raise ValueError."""
     about = frame.getTransformation()
     if not about.isValid():
         raise ValueError("its images come without intrinsics: the device is not calibrated")

@@ -40,10 +40,7 @@ def compare(
     facts: Mapping[str, Any] | None = None,
     entries: Sequence[model.RunEntry] = (),
 ) -> model.Comparison:
-    """Compare runs, in the order of the tables, and each with the first unless contrasts are given.
-
-    Raises UsageError if there is no run, or one holds no flight, or a seed twice.
-    """
+    """Compare runs, in the order of the tables; without contrasts each with the first."""
     if not runs:
         raise UsageError(f"no run here; accepted: a {kind} of one run or more")
     by_name = {entry.name: entry for entry in entries}
