@@ -73,11 +73,8 @@ def _part(part: Part) -> str:
 
 def latency_table(summary: RunSummary) -> table.TableView:
     """Return the latencies by stage."""
-    columns = (
-        table.Column("stage", number=False),
-        *table.DURATION_COLUMNS,
-        table.Column("from → to", number=False, page_only=True),
-    )
+    head, last = table.columns_of("<stage | *<from → to")
+    columns = (head, *table.DURATION_COLUMNS, last)
     rows, short = [], False
     for stage in summary.shown_stages:
         cells = table.duration_cells(summary.stages[stage.key])
@@ -103,13 +100,10 @@ def failures_first(episodes: Sequence[EpisodeRecord], most: int) -> list[Episode
 def episodes_table(run: LoadedRun, most: int | None = None) -> table.TableView:
     """Return the quality of each flight, or of at most so many, those that failed first."""
     feeds = not run.info.setup.computer_on_ground
-    columns = (
-        *table.columns_of(
-            "# | seed | <outcome | time [s] | distance [m] | "
-            "energy [kJ] | speed [m/s] | *top speed [m/s]"
-        ),
-        *([table.Column("computer", "J", page_only=True)] if feeds else []),
-        *table.columns_of("*take-off [s, kJ] | *battery [%] | *<why"),
+    columns = table.columns_of(
+        "# | seed | <outcome | time [s] | distance [m] | energy [kJ] | speed [m/s] | "
+        f"*top speed [m/s]{' | *computer [J]' if feeds else ''} | *take-off [s, kJ] | "
+        "*battery [%] | *<why"
     )
     total = len(run.episodes)
     shown = run.episodes if most is None else failures_first(run.episodes, most)
@@ -313,10 +307,7 @@ def ages_table(ages: CommandAges, end_to_end: Summary) -> table.TableView | None
     n = ages.youngest_us.size
     if not n or not ages.time_us:
         return None
-    columns = (
-        table.Column("how old the flown command was", number=False),
-        *table.DURATION_COLUMNS,
-    )
+    columns = (*table.columns_of("<how old the flown command was"), *table.DURATION_COLUMNS)
     rows = (
         ("as it took effect, by decision", *table.duration_cells(end_to_end)),
         (

@@ -11,6 +11,7 @@ from importlib.resources import files
 from typing import Any
 
 import numpy as np
+from matplotlib.colors import to_hex
 from numpy.typing import NDArray
 
 from airl_mav.arena.draw import GOAL_COLOUR, MOVING_COLOURS, START_COLOUR
@@ -130,7 +131,7 @@ def flight_view(flight: SceneFlight, top: float, fov_deg: float) -> dict[str, An
     up = goal_height_m(record.goal) or base + 0.1
     ring = _ring(east, north, record.goal_radius_m) + np.array([0.0, 0.0, base])
     speed_bar = {"title": {"text": "m/s"}, "thickness": 12, "len": 0.5, "x": 1.0}
-    scale = [[i / 15.0, _hex(speed_colours()(i / 15.0))] for i in range(16)]
+    scale = [[i / 15.0, to_hex(speed_colours()(i / 15.0))] for i in range(16)]
     traces += [
         _line(shadow, "#8d969f", "shadow", width=2),
         {
@@ -396,7 +397,3 @@ def _east_north_up(points: Floats) -> Floats:
 def _rounded(values: Floats) -> list[Any]:
     rounded: list[Any] = (np.round(values, 2) + 0.0).tolist()
     return rounded
-
-
-def _hex(colour: tuple[float, float, float, float]) -> str:
-    return "#" + "".join(f"{round(255.0 * channel):02x}" for channel in colour[:3])
