@@ -86,15 +86,15 @@ def prepare(asked: StandAloneCompanion) -> Mission:
     loaded = piloting.load_asked_policy(asked, policy, pilot.hold_s, asked.seed)
     sampler = injection.sampler(latency_generator(asked.seed, asked.latency_seed))
     vehicle, compensator = load_vehicle(asked.vehicle), None
-    if asked.tell_obstacles and vehicle.camera.kind != "depth":
-        accepted = "with a vehicle whose camera gives depth"
-        raise FieldError("tell_obstacles", asked.tell_obstacles, accepted)
-    if asked.tell_obstacles and vehicle.camera.projection == "fisheye":
-        accepted = "with a vehicle whose camera is a pinhole or a cylinder"
-        raise FieldError("tell_obstacles", asked.tell_obstacles, accepted)
-    if asked.tell_obstacles and vehicle.camera.yaw_deg != 0.0:
-        accepted = "with a vehicle whose camera looks ahead (camera.yaw_deg = 0)"
-        raise FieldError("tell_obstacles", asked.tell_obstacles, accepted)
+    needs = {
+        "gives depth": vehicle.camera.kind == "depth",
+        "is a pinhole or a cylinder": vehicle.camera.projection != "fisheye",
+        "looks ahead (camera.yaw_deg = 0)": vehicle.camera.yaw_deg == 0.0,
+    }
+    for need, met in needs.items():
+        if asked.tell_obstacles and not met:
+            accepted = f"with a vehicle whose camera {need}"
+            raise FieldError("tell_obstacles", asked.tell_obstacles, accepted)
     # What its card says is held against the camera's first frame, before take-off.
     if policy.card is None and (reason := camera_refused(policy, vehicle)):
         raise FieldError(

@@ -1,4 +1,4 @@
-"""Reactions to a silent decision loop, camera or link.
+"""Reactions to a silent decision loop, camera or link, and the guard that calls them in time.
 
 MAVSDK repeats the last setpoint at 20 Hz, so a hung policy would keep the vehicle moving and
 prevent the offboard-loss failsafe. Three lines of defence:

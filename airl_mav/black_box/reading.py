@@ -15,8 +15,7 @@ from mcap.records import Message as Record
 from mcap.stream_reader import CRCValidationError, StreamReader
 from pydantic import TypeAdapter, ValidationError
 
-from airl_mav.black_box.channels import JSON
-from airl_mav.black_box.messages import TOPICS, Message
+from airl_mav.black_box.messages import JSON, TOPICS, Message
 from airl_mav.black_box.writing import METADATA, RUN
 from airl_mav.core.errors import UsageError
 
@@ -36,7 +35,7 @@ class BlackBox:
     path: Path
     run: dict[str, Any]
     """What flew, as `run.json` has it."""
-    messages: dict[type[Message], list[Any]] = field(default_factory=dict)
+    messages: dict[type[Any], list[Any]] = field(default_factory=dict)
     whole: bool = False
     """Whether it was closed, or ends somewhere: the program, the computer or the power failed."""
     damaged: bool = False

@@ -11,8 +11,7 @@ from typing import IO, Any
 
 from mcap.writer import CompressionType, IndexType, Writer
 
-from airl_mav.black_box.channels import Channel, encoded
-from airl_mav.black_box.messages import Message
+from airl_mav.black_box.messages import Channel, Message, encoded
 from airl_mav.core.clock import NS_PER_US
 
 METADATA = "airl-mav"

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from pydantic import Field
@@ -122,15 +121,10 @@ class Voice:
             self._json.tell(Started(SCHEMA, self._command, __version__, now))
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *raised: Any) -> None:
         """Remove the bars."""
         if self._drawn is not None:
-            self._drawn.__exit__(kind, error, trace)
+            self._drawn.__exit__(*raised)
 
     def finish(
         self,

@@ -1,4 +1,4 @@
-"""The stages of a decision: which two stamps each one lies between."""
+"""The stages of a decision: their stamps and durations, and which decisions miss a deadline."""
 
 from __future__ import annotations
 

@@ -306,10 +306,11 @@ def match_setpoints(
 ) -> NDArray[np.int64]:
     """Match each sent setpoint (n, 4) with the first accepted copy of it.
 
-    A copy counts when it was accepted at or after the sending, before the next one was sent, and
-    carries the same four numbers (NaN, an unused field, equals NaN). When a decision repeats the
-    one before, a resend of that one still under way counts as well. It commands the same. Return
-    the index (n,) into the accepted ones, `UNMATCHED` where there is none.
+    MAVSDK sends a setpoint at once, and again at 20 Hz until the next one. A copy counts when it
+    was accepted at or after the sending, before the next one was sent, and carries the same four
+    numbers (NaN, an unused field, equals NaN). When a decision repeats the one before, a resend of
+    that one still under way counts as well. It commands the same. Return the index (n,) into the
+    accepted ones, `UNMATCHED` where there is none.
     """
     sent = np.asarray(sent_us, np.int64)
     accepted = np.asarray(accepted_us, np.int64)

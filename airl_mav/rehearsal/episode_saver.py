@@ -8,7 +8,6 @@ hands out flights must not wait for the disk. The files and what they promise ar
 from __future__ import annotations
 
 import threading
-from types import TracebackType
 
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
@@ -41,12 +40,7 @@ class EpisodeSaver:
         self._thread.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         """Save the rest. Raises the error of a save that failed, unless one is under way."""
         with self._changed:
             self._ending = True

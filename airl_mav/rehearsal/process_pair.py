@@ -1,4 +1,4 @@
-"""Firmware and companion as one: started, listened to and ended together."""
+"""Firmware and companion as one: started, listened to, made to fail and ended together."""
 
 from __future__ import annotations
 

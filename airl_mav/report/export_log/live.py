@@ -8,7 +8,7 @@ from collections.abc import Callable
 import foxglove
 from foxglove.websocket import ChannelView, Client, ServerListener
 
-from airl_mav.black_box.channels import Channel
+from airl_mav.black_box.messages import Channel
 from airl_mav.core.clock import NS_PER_US, Clock, WallClock
 from airl_mav.core.errors import FieldError
 from airl_mav.core.ports import LOOPBACK

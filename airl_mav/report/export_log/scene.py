@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena, Bounds, Shape
 from airl_mav.arena.triangles import drawn, standing
-from airl_mav.black_box.channels import Channel
+from airl_mav.black_box.messages import Channel
 from airl_mav.core import frames
 from airl_mav.core.clock import NS_PER_US
 from airl_mav.core.constants import US_PER_S

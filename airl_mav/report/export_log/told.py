@@ -12,10 +12,10 @@ import numpy as np
 from foxglove import messages
 from numpy.typing import NDArray
 
-from airl_mav.black_box.channels import Channel, encoded
 from airl_mav.black_box.messages import (
     INFO,
     WARNING,
+    Channel,
     Command,
     End,
     Latency,
@@ -24,6 +24,7 @@ from airl_mav.black_box.messages import (
     Status,
     Telemetry,
     Truth,
+    encoded,
     text,
 )
 from airl_mav.core.clock import since_1970_us
