@@ -17,7 +17,7 @@ from airl_mav.core.cpu_quota import held_to
 from airl_mav.core.errors import FieldError
 from airl_mav.core.goals import Goal
 from airl_mav.core.provenance import describe_machine
-from airl_mav.flight.setup import Part, Setup
+from airl_mav.flight.record import Part, Setup
 from airl_mav.latency.samplers import LatencySampler, latency_generator
 from airl_mav.policy.actions import Policy
 from airl_mav.policy.learned import LearnedPolicy

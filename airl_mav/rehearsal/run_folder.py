@@ -22,8 +22,7 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.log_file import PARTIAL_SUFFIX
 from airl_mav.core.provenance import describe_machine, git_state, package_versions
 from airl_mav.flight.record import SCHEMA as LINE_SCHEMA
-from airl_mav.flight.record import EpisodeRecord
-from airl_mav.flight.setup import Setup
+from airl_mav.flight.record import EpisodeRecord, Setup
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.scenario.file import SCENARIO_FILE, save_scenario
 from airl_mav.scenario.model import free_fields

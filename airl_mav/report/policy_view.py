@@ -205,10 +205,7 @@ class _Companion:
         earlier = self._earlier
         self._earlier = ((image, state), *earlier)[: MOST_FRAMES - 1]
         where = np.asarray(goal, np.float64)
-        in_flight = observation.InFlight(told.latency_s, told.age_s, told.setpoint)
-        return observation.observe(
-            image, self._intrinsics, state, where, in_flight, earlier, further
-        )
+        return observation.observe(image, self._intrinsics, state, where, told, earlier, further)
 
     def decided(
         self, setpoint: NDArray[np.float64], t2_us: int, sent_us: int, stops_us: int | None

@@ -17,10 +17,9 @@ from pydantic import TypeAdapter
 from airl_mav.core.errors import EXIT_INVALID, EXIT_NOT_MET, EXIT_UNDECIDED
 from airl_mav.core.files import read_typed, replace_file, write_json
 from airl_mav.flight.paired import PairedComparison
-from airl_mav.flight.record import EpisodeRecord
+from airl_mav.flight.record import EpisodeRecord, Setup
 from airl_mav.flight.requirements import Finding, Requirement, find
 from airl_mav.flight.sequential import Decision
-from airl_mav.flight.setup import Setup
 from airl_mav.flight.statistics import Aggregate, Estimate
 from airl_mav.rehearsal.run_folder import RunInfo
 from airl_mav.report.document import environment
