@@ -180,7 +180,7 @@ def _nothing(why: str, known: float, quadratic_1_m: float) -> Air:
 
 
 def _estimate(of: FittedQuantity, value: float, drawn: Array, source: str) -> FittedQuantity:
-    return of.found(value, *np.quantile(drawn, (0.025, 0.975)), source)
+    return of.found((value, *np.quantile(drawn, (0.025, 0.975))), source)
 
 
 def _felt_rows(flown: Flown, bias_m_s2: float) -> _Rows | None:

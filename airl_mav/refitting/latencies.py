@@ -67,13 +67,13 @@ def _mean(
         return of.without(why)
     mean, source = float(values_ms.mean()), f"stamps of {len(values_ms)} decisions"
     if np.ptp(values_ms) == 0.0:
-        return of.found(mean, mean, mean, source)
+        return of.found((mean, mean, mean), source)
     found = bootstrap(
         (values_ms,), np.mean, n_resamples=RESAMPLES, confidence_level=LEVEL, rng=rng
     ).confidence_interval
     wider = float(np.sqrt(max(1.0, integrated_time(values_ms))))
     low, high = (mean + wider * (float(end) - mean) for end in (found.low, found.high))
-    return of.found(mean, low, high, source)
+    return of.found((mean, low, high), source)
 
 
 def _link(clocks: Alignment | None) -> FittedQuantity:
@@ -83,4 +83,4 @@ def _link(clocks: Alignment | None) -> FittedQuantity:
         return LINK.without(f"{clocks.setpoints} setpoints were seen in the log")
     low_ms, high_ms = ((clocks.told_us + end) / US_PER_MS for end in clocks.accepted_range_us)
     source = f"{clocks.setpoints} setpoints and the telemetry, found again in the vehicle's log"
-    return LINK.found(clocks.round_trip_us / US_PER_MS, low_ms, high_ms, source)
+    return LINK.found((clocks.round_trip_us / US_PER_MS, low_ms, high_ms), source)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -51,9 +51,10 @@ class FittedQuantity:
             return None
         return 0.5 * (self.high - self.low)
 
-    def found(self, value: float, low: float, high: float, source: str) -> FittedQuantity:
-        """Return it with a value, its interval and their source."""
-        return replace(self, value=float(value), low=float(low), high=float(high), source=source)
+    def found(self, ends: Iterable[float], source: str) -> FittedQuantity:
+        """Return it with a value, the low and the high end of its interval, and their source."""
+        value, low, high = map(float, ends)
+        return replace(self, value=value, low=low, high=high, source=source)
 
     def without(self, why: str) -> FittedQuantity:
         """Return it as not observable."""

@@ -187,7 +187,7 @@ def _velocity(
     shift_s, unsure_s, source = _link_share(flown)
     low_s, high_s = (math.hypot(end, unsure_s) for end in ends[:, 0])
     value = float(found.x[0]) - shift_s
-    dead = dead.found(value, value - low_s, value + high_s, source)
+    dead = dead.found((value, value - low_s, value + high_s), source)
     lag = _with_interval(lag, float(found.x[1]), ends[:, 1], f"velocity in {flown.told_by}")
     return _known_to(dead, WIDEST_S), _known_to(lag, max(WIDEST_S, WIDEST_SHARE * found.x[1]))
 
@@ -273,7 +273,7 @@ def _best(
 
 
 def _with_interval(known: FittedQuantity, value: float, ends: Array, source: str) -> FittedQuantity:
-    return known.found(value, value + ends[0], value + ends[1], source)
+    return known.found((value, value + ends[0], value + ends[1]), source)
 
 
 def _known_to(estimate: FittedQuantity, widest: float) -> FittedQuantity:

@@ -63,12 +63,12 @@ def thrust_of(found: FittedQuantity, vehicle: VehicleProfile, known: Known) -> T
         return Thrust(found, hover.without(why), mass.without(why), rotor.without(why))
     ends = np.array([found.value, found.low, found.high])
     low_last = ends[[0, 2, 1]]
-    hover = hover.found(*GRAVITY_M_S2 / low_last, found.source)
+    hover = hover.found(GRAVITY_M_S2 / low_last, found.source)
     only = "only thrust per mass is observable; the {} is taken from the profile"
     if known == "thrust":
-        mass = mass.found(*vehicle.thrust_n / low_last, found.source)
+        mass = mass.found(vehicle.thrust_n / low_last, found.source)
         return Thrust(found, hover, mass, rotor.without(only.format(known)))
-    rotor = rotor.found(*ends * mass_kg / len(CORNERS), found.source)
+    rotor = rotor.found(ends * mass_kg / len(CORNERS), found.source)
     return Thrust(found, hover, mass.without(only.format(known)), rotor)
 
 
@@ -98,7 +98,7 @@ def _ratio(
     if 0.5 * (high - low) > WIDEST * value:
         return blank.without(f"known to {0.5 * (high - low) / value:.0%}; {WIDEST:.0%} is needed")
     source = "motor commands and accelerometer in the vehicle's log"
-    return blank.found(value, low, high, source)
+    return blank.found((value, low, high), source)
 
 
 def _shares(commands: Array, log: VehicleLog, vehicle: VehicleProfile) -> Array:

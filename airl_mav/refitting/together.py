@@ -109,7 +109,7 @@ def pooled(alone: Sequence[FittedQuantity]) -> FittedQuantity:
     value, error = random_effects(values, sigma)
     half = QUANTILE * error
     source = f"{len(told)} of {len(alone)} flights: {told[0].source}"
-    return told[0].found(value, value - half, value + half, source)
+    return told[0].found((value, value - half, value + half), source)
 
 
 def random_effects(values: Array, sigma: Array) -> tuple[float, float]:

@@ -179,7 +179,7 @@ class FlightMessages:
         for i in range(0, len(path), SAMPLES_A_SCENE):
             time_us = int(path.time_us[i])
             at = timestamp(self._unix_us(time_us))
-            command = commanded[i] if self.flight.navigates(time_us) else None
+            command = commanded[i] if self._record.navigates(time_us) else None
             arrows = velocity_scene(path.position[i], path.velocity[i], command, at)
             yield self._drawn(time_us, "/scene/velocity", arrows)
             if arena is not None and arena.tours:
@@ -239,7 +239,7 @@ class FlightMessages:
         charge = charge_of(self.flight)
         for i in range(0, len(self._path), SAMPLES_A_STATUS):
             time_us = int(self._path.time_us[i])
-            navigates = self.flight.navigates(time_us)
+            navigates = self._record.navigates(time_us)
             flies = navigates or -float(self._path.position[i, 2]) > STANDING_M
             battery = (
                 (None, None, None)
@@ -260,7 +260,7 @@ class FlightMessages:
         which = np.searchsorted(columns["sent_us"], self._path.time_us, side="right") - 1
         rates = np.where(which < 0, 0.0, columns[SETPOINT][np.maximum(which, 0), 3])
         for i, time_us in enumerate(self._path.time_us.tolist()):
-            if self.flight.navigates(time_us):
+            if self._record.navigates(time_us):
                 command = Command(time_us, tuple(velocities[i].tolist()), float(rates[i]))
                 yield self._ours(time_us, command)
 
