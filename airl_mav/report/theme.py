@@ -88,6 +88,10 @@ class Picture:
         width, height = (round(float(points) * CSS_PX_PER_PT) for points in found.groups())
         return width, height
 
+    def data_uri(self) -> str:
+        """Return the SVG for an `img` of a template."""
+        return "data:image/svg+xml;base64," + base64.b64encode(self.svg.encode()).decode()
+
 
 LABEL_LEFT_IN = 0.04
 """Where the labels of stacked axes begin, from the left [inch]."""

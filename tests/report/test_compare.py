@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import io
 import json
 import re
@@ -211,6 +212,7 @@ def test_panels_share_their_axes(loaded: tuple[Comparison, dict[str, LoadedRun]]
     pictures = flight_pictures("fan", flight_panels(compared.runs[:3], runs))
     ticks = [set(re.findall(r">(−?\d+)</text>", picture.svg)) for picture in pictures]
     assert ticks[0] == ticks[1] == ticks[2]
+    assert {len(base64.b64decode(p.data_uri().partition(",")[2])) > 0 for p in pictures} == {True}
 
 
 def test_the_page_is_whole_and_reaches_nothing_else(page: Path, compared: Comparison) -> None:
