@@ -100,7 +100,7 @@ def seen_decisions(
     vehicle: VehicleProfile,
     again: PolicyAgain | None = None,
 ) -> Iterator[SeenDecision]:
-    """Yield the recorded decisions of a flight in order; scores need the policy in `again`."""
+    """Yield the decisions of a flight until its outcome; scores need the policy in `again`."""
     path, stamps = run.trajectories.get(record.index), run.latency.get(record.index, {})
     column = setpoint_column(stamps) or SETPOINT
     needed = ("capture_us", "infer_start_us", "action_ready_us", "sent_us", column)
@@ -120,7 +120,7 @@ def seen_decisions(
     policy = None if again is None else again.policy.with_generator(np.random.default_rng(0))
     for number in range(min(MOST, len(stamps["sent_us"]))):
         captured, began, ready, sent = (int(stamps[name][number]) for name in needed[:4])
-        if NO_STAMP in (captured, began, ready, sent):
+        if NO_STAMP in (captured, began, ready, sent) or sent > record.ended_us:
             continue
         image, state = lens.image(captured), _telemetry(stamps, path, began)
         views = {name: each.view(captured) for name, each in further.items()}
