@@ -52,6 +52,9 @@ REST_SPEED_M_S = 0.1
 STILL = 1e-4
 """A vehicle rests below this speed [m/s] and turn rate [rad/s]."""
 
+NEVER_US = 1 << 61
+"""Begin of the tours of obstacles that stand still [µs]."""
+
 STOPPED: Speeds = (0.0, 0.0, 0.0, 0.0)
 
 
@@ -187,7 +190,11 @@ class Plant:
     @property
     def _elapsed_us(self) -> int:
         """How long what moves has been under way [µs]."""
-        return self.record["time_us"].item(0) - self.record["moves_us"].item(0)
+        return max(0, self.record["time_us"].item(0) - self.record["moves_us"].item(0))
+
+    def hold_obstacles(self) -> None:
+        """Keep what moves where its tours begin, until `begin`."""
+        self.record["moves_us"] = NEVER_US
 
     def begin(self) -> None:
         """Let what moves set out now; contacts so far are forgotten."""
@@ -345,7 +352,7 @@ class Plant:
             body.look_around()
         ticks, rate_hz = record["ticks"].item(0) + 1, record["rate_hz"].item(0)
         time_us = record["start_us"].item(0) + ticks * US_PER_S // rate_hz
-        after = body.move(here, force, torque, before, time_us - record["moves_us"].item(0))
+        after = body.move(here, force, torque, before, max(0, time_us - record["moves_us"].item(0)))
         if body.touch.close or self._touching:
             self._watch(body.touch, before, time_us)
         record["room_m"], record["resting"] = -math.inf, 0
