@@ -167,6 +167,7 @@ class Pacing:
     """As fast as possible until `paced`, then in real time; notes how late ticks begin."""
 
     quiet_until_us = 0.0
+    arrivals = None
 
     def __init__(self) -> None:
         self._wall = WallPacing(1.0)

@@ -1,4 +1,4 @@
-"""The black box: what the companion saw, decided and sent, in a file that survives a crash.
+"""The black box: the companion's images, decisions and setpoints in a file that survives a crash.
 
 A thread samples telemetry, status and resources, takes the pilot's decisions without delaying it,
 and syncs the file four times a second.
@@ -17,7 +17,7 @@ from typing import Any, Protocol
 import psutil
 
 from airl_mav.black_box import messages
-from airl_mav.black_box.channels import encoded
+from airl_mav.black_box.messages import encoded
 from airl_mav.black_box.writing import BlackBoxFile
 from airl_mav.core.clock import Clock, processor_time_us, utc_now, utc_us
 from airl_mav.core.constants import US_PER_S
@@ -41,7 +41,7 @@ SYNC_US = US_PER_S // 4
 
 
 class RecordedLink(Protocol):
-    """What the black box asks of the link."""
+    """Requirements of the black box on the link."""
 
     def kinematics(self) -> Kinematics:
         """Return the newest telemetry."""
@@ -221,11 +221,7 @@ def open_recorder(
     clock: Clock,
     goal: Goal,
 ) -> BlackBoxRecorder:
-    """Return the recorder of a mission into a new file of a folder, or raise FieldError.
-
-    `run` has `setup` and `config` of `run.json`; the goal is north, east and down from the start
-    [m].
-    """
+    """Return the recorder of a mission into a new file of a folder, or raise FieldError."""
     now = utc_now()
     made = {
         "name": "flight",

@@ -58,11 +58,7 @@ class ZmqFrameSource:
     def __init__(
         self, endpoint: str, clock: Clock, context: zmq.Context[zmq.Socket[bytes]] | None = None
     ) -> None:
-        """Connect to an endpoint such as "tcp://192.168.1.2:5560"; the publisher may start later.
-
-        The clock of simulated time stamps frames. `context` = a ZeroMQ context to share. Raises
-        FieldError for an unusable endpoint.
-        """
+        """Connect to an endpoint such as "tcp://192.168.1.2:5560", or raise FieldError."""
         self.malformed = 0
         """Messages that were no frames, or frames of another size than the first one's."""
         self.failure: str | None = None

@@ -23,14 +23,7 @@ class Sleep(Protocol):
     def __call__(
         self, wake_us: int, interrupt: threading.Event | None = None, poll: Poll | None = None
     ) -> None:
-        """Return with the next turn, which may come earlier than asked for.
-
-        Args:
-            wake_us: Simulated time of the next turn [µs].
-            interrupt: Ends the sleep when it is set.
-            poll: Postpones `wake_us` by its interval while it is not due. A scheduler may ignore
-                it.
-        """
+        """Return with the next turn; at `wake_us`, or later while a `poll` is not due."""
         ...
 
 
@@ -39,10 +32,7 @@ class Abandoned(BaseException):
 
 
 class ConductedClock:
-    """Simulated time of a companion in lockstep, and the watchdog's guard. Implements `Clock`.
-
-    Only sleeping takes simulated time, so deadlines can only pass there.
-    """
+    """Simulated time of a companion in lockstep, which only sleeping takes, and its guard."""
 
     def __init__(self, clock: Clock, sleep: Sleep) -> None:
         """Take the simulated time, which the scheduler advances, and what gives the turn back."""

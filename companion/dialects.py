@@ -1,7 +1,7 @@
 """How flight controllers differ behind MAVSDK; the rest of the companion knows one kind only.
 
-Measured with MAVSDK 4.1 on PX4 1.16 and ArduCopter 4.7. What MAVSDK itself hides is not here:
-take-off and offboard fly in ArduCopter's GUIDED mode, leaving offboard is its BRAKE mode, and the
+Measured with MAVSDK 4.1 on PX4 1.16 and ArduCopter 4.7. What MAVSDK itself hides is not here.
+Take-off and offboard fly in ArduCopter's GUIDED mode, leaving offboard is its BRAKE mode. The
 altitude of a take-off travels with the command.
 """
 

@@ -1,8 +1,4 @@
-"""Pre-flight check on the ground: `airl-companion --check`.
-
-Camera, flight controller and policy run as in flight for a few seconds, without arming or
-setpoints.
-"""
+"""Pre-flight check without arming: camera, flight controller and policy for a few seconds."""
 
 from __future__ import annotations
 
@@ -150,10 +146,9 @@ def look_at_vehicle(link: MavsdkLink, mission: Mission, stop: threading.Event) -
 def time_decisions(mission: Mission, seen: ReceivedFrame, state: Kinematics) -> Finding:
     """Let the policy decide on what is seen, and say how long that takes (t2)."""
     frame, watch, took_us = seen.frame, WallClock(), []
-    told = InFlight.of_first_decisions(1)
     observation = observe(
         *(frame.image, frame.intrinsics, state, np.asarray(mission.goal, np.float64)),
-        InFlight(told.latency_s[0], told.age_s[0], told.setpoint[0]),
+        InFlight.of_first_decisions(1).rows(0),
         further=views_of(frame),
     )
     try:

@@ -1,4 +1,4 @@
-"""What the pilot needs of a flight controller, as plain data and a protocol."""
+"""The pilot's view of a flight controller, as plain data and a protocol."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ CAMERA_SILENT = "camera silent"
 
 
 TELEMETRY_FROZEN = "telemetry frozen"
-"""Why a mission ended: what the flight controller said did not change any more."""
+"""Why a mission ended: telemetry did not change."""
 
 FRAMES_LATE = "frames late"
 """Why a mission ended: frames came, but long after they were taken."""
@@ -62,11 +62,11 @@ Due: TypeAlias = "Callable[[Sequence[bytes]], bool]"
 that MAVSDK has not received yet."""
 
 Setpoint: TypeAlias = "BodyVelocity | Attitude | BodyRates"
-"""What is sent: four numbers each."""
+"""Setpoints of four numbers each."""
 
 
 class Link(Protocol):
-    """What the pilot needs of a flight controller. Calls raise LinkError when refused."""
+    """The pilot's view of a flight controller. Calls raise LinkError when refused."""
 
     @property
     def connected(self) -> bool:

@@ -47,7 +47,7 @@ MODE_KNOWN_S = 3.0
 """Time until a change of mode must have been reported [s]: three heartbeats of 1 Hz."""
 
 STEP_M = 5.0
-"""A position may jump this far beyond what its velocity explains [m]: more than the resets of an
+"""A position may jump this far beyond what its velocity explains [m]. More than the resets of an
 estimator that finds its GPS again within its gates."""
 
 DRIFT_M = 8.0
@@ -120,15 +120,7 @@ class Limits:
         mount_pitch_up_rad: float = 0.0,
         mount_yaw_rad: float = 0.0,
     ) -> None:
-        """Prepare a flight.
-
-        Args:
-            settings: The bounds.
-            goal: North, east of the start [m], and down where it has a height.
-            pilot: Settings of the pilot.
-            mount_pitch_up_rad: Pitch of the camera mount, up [rad].
-            mount_yaw_rad: Yaw of the camera mount, right [rad].
-        """
+        """Prepare a flight to a goal north, east and, where it has a height, down [m]."""
         self.ending: Ending | None = None
         """What has ended the flight."""
         self._vehicle = VehicleLimits(settings, goal, pilot)

@@ -1,7 +1,4 @@
-"""The companion's link to the flight controller: MAVSDK's synchronous API, without a thread hop.
-
-MAVSDK repeats setpoints at 20 Hz from its own thread, even when this process hangs: `watchdog.py`.
-"""
+"""The companion's link to the flight controller: MAVSDK's synchronous API, without a thread hop."""
 
 from __future__ import annotations
 
@@ -21,13 +18,8 @@ from mavsdk.plugins.offboard import AttitudeRate, Offboard, OffboardError, Veloc
 from mavsdk.plugins.server_utility import ServerUtility, StatusTextType
 from mavsdk.plugins.telemetry import FlightMode, Telemetry, TelemetryError, TelemetryResult
 
+from airl_mav.core import constants
 from airl_mav.core.clock import Clock, WallClock
-from airl_mav.core.constants import (
-    TAKEOFF_REACHED_M,
-    TAKEOFF_REACHED_M_S,
-    UNMEASURED_A,
-    US_PER_S,
-)
 from airl_mav.policy.actions import Attitude
 from airl_mav.policy.observation import Kinematics
 from companion import interfaces
@@ -41,7 +33,7 @@ HEALTH_SETTLE_S = 0.5
 """Time that health must be good before arming: more than two of PX4's 5 Hz reports [s]."""
 
 OFFBOARD_SETTLE_S = 0.1
-"""Wait after the switch to offboard [s]. PX4 acknowledges it before all of its parts know: a
+"""Wait after the switch to offboard [s]. PX4 acknowledges it before all of its parts know. A
 setpoint that comes within some 10 ms is dropped, and MAVSDK repeats it only 50 ms later."""
 
 OFFBOARD_REPEAT_S = 0.05
@@ -88,14 +80,10 @@ class MavsdkLink:
     ) -> None:
         """Open a connection, as `open_connection`; `connect` waits for the vehicle.
 
-        Args:
-            url: MAVSDK connection.
-            clock: For timeouts.
-            abandon: Set from another thread to end any wait.
-            heard: Whether the flight controller is received, independent of wall time; None =
-                MAVSDK decides.
-            poll: Sleeps for an interval [µs], and again while a condition need not be checked;
-                None = it is checked after every interval.
+        `abandon`, set from another thread, ends any wait. `heard` says whether the flight
+        controller is received, independent of wall time; None = MAVSDK decides. `poll` sleeps for
+        an interval [µs], and again while a condition need not be checked; None = it is checked
+        after every interval.
         """
         self.url = url
         self._clock = clock
@@ -134,7 +122,7 @@ class MavsdkLink:
     def prepare(self, timeout_s: float, stop: threading.Event | None = None) -> None:
         """Prepare a connection that may have seen other missions.
 
-        The flight controller may be a different one or have restarted: cached state is dropped and
+        The flight controller may be a different one or have restarted. Cached state is dropped and
         streams are requested anew, unless right after `connect`. Raises LinkError after a timeout
         [wall s], without streams, or on `stop`.
         """
@@ -143,7 +131,7 @@ class MavsdkLink:
             return
         stopwatch = WallClock()
         while not self.connected:
-            if stopwatch.time_us() > timeout_s * US_PER_S:
+            if stopwatch.time_us() > timeout_s * constants.US_PER_S:
                 raise interfaces.LinkError(
                     f"no flight controller heard on {self.url} in {timeout_s:g} s"
                 )
@@ -164,14 +152,14 @@ class MavsdkLink:
                     getattr(self._telemetry, f"set_rate_{name}")(rate_hz)
                     break
                 except TelemetryError as error:
-                    if stopwatch.time_us() > STREAM_TIMEOUT_S * US_PER_S:
+                    if stopwatch.time_us() > STREAM_TIMEOUT_S * constants.US_PER_S:
                         raise interfaces.LinkError(f"no telemetry: {_refusal(error)}") from None
                 self._pause_wall(stop)
 
     def _pause_wall(self, stop: threading.Event | None) -> None:
         if self._abandon.is_set() or (stop is not None and stop.is_set()):
             raise interfaces.LinkError("stopped")
-        WallClock().sleep_until(int(STREAM_RETRY_S * US_PER_S), self._abandon)
+        WallClock().sleep_until(int(STREAM_RETRY_S * constants.US_PER_S), self._abandon)
 
     def exchange_raw(self, sent: Callable[[bytes], None]) -> Callable[[bytes], None]:
         """Take over the bytes of a `raw://` connection; see `mavsdk_connection.exchange_raw`."""
@@ -267,7 +255,7 @@ class MavsdkLink:
         return interfaces.BatteryState(
             # No battery that flies has 0 V: nothing was heard of it yet.
             _known(told.voltage_v) or None,
-            None if current_a == UNMEASURED_A else current_a,
+            None if current_a == constants.UNMEASURED_A else current_a,
             None if percent is None else percent / 100.0,
         )
 
@@ -283,14 +271,14 @@ class MavsdkLink:
     ) -> None:
         """Wait until the flight controller reports good health, then arm; `stop` ends the wait.
 
-        Right after a reboot a health report may be out of date: it must have been good for a while,
+        Right after a reboot a health report may be out of date. It must have been good for a while,
         and a refused request is repeated. `origin` (latitude, longitude [deg], altitude [m]) is
         sent to a flight controller without a position.
         """
         deadline_us = self._deadline(timeout_s)
         good_since_us, tell_us = self._clock.time_us(), self._clock.time_us()
         missing: list[str] = []
-        while self._clock.time_us() < good_since_us + int(HEALTH_SETTLE_S * US_PER_S):
+        while self._clock.time_us() < good_since_us + int(HEALTH_SETTLE_S * constants.US_PER_S):
             lacking = f" ({', '.join(missing)})" if missing else ""
             late = f"not healthy after {timeout_s:g} s: it refuses to arm{lacking}"
             self._check(deadline_us, late, stop)
@@ -315,14 +303,14 @@ class MavsdkLink:
         if now_us < due_us:
             return due_us
         self._call("origin", lambda: self._action.set_gps_global_origin(*origin))
-        return now_us + int(ORIGIN_RETRY_S * US_PER_S)
+        return now_us + int(ORIGIN_RETRY_S * constants.US_PER_S)
 
     def takeoff(self, altitude_m: float, timeout_s: float, stop: threading.Event) -> None:
         """Take off and return at an altitude above the start, or on `stop`."""
         start_down = float(self.kinematics().position[2])
         self._call("take-off", lambda: self._action.set_takeoff_altitude(altitude_m))
         self._call("take-off", self._action.takeoff)
-        deadline_us, least_m = self._deadline(timeout_s), altitude_m - TAKEOFF_REACHED_M
+        deadline_us, least_m = self._deadline(timeout_s), altitude_m - constants.TAKEOFF_REACHED_M
 
         def high(frames: Sequence[bytes]) -> bool:
             position = _newest(frames, _LOCAL_POSITION_NED)
@@ -331,7 +319,7 @@ class MavsdkLink:
         while True:
             state = self.kinematics()
             height, speed = start_down - float(state.position[2]), abs(float(state.velocity[2]))
-            if height > least_m and speed < TAKEOFF_REACHED_M_S:
+            if height > least_m and speed < constants.TAKEOFF_REACHED_M_S:
                 return
             self._check(deadline_us, f"take-off: {height:.1f} m after {timeout_s:g} s", stop)
             self._pause_until(high, deadline_us, stop)
@@ -343,11 +331,7 @@ class MavsdkLink:
         self._pause(OFFBOARD_SETTLE_S)
 
     def await_hover(self, altitude_m: float, timeout_s: float, stop: threading.Event) -> None:
-        """Wait until telemetry shows a vehicle that hovers near an altitude above the start.
-
-        The position arrives at 50 Hz, armed and landed state once a second. `stop`, set from
-        outside, ends the wait.
-        """
+        """Wait until telemetry, once a second, shows a vehicle that hovers near an altitude."""
         deadline_us = self._deadline(timeout_s)
         while not -float(self.kinematics().position[2]) > altitude_m / 2:  # NaN before the first
             self._check(deadline_us, f"not in the air after {timeout_s:g} s", stop)
@@ -356,8 +340,7 @@ class MavsdkLink:
     def await_offboard(self, stop: threading.Event) -> None:
         """Send zero velocity until a pilot has switched the vehicle to offboard, or on `stop`.
 
-        PX4 rejects offboard without setpoints, and MAVSDK stops them at each heartbeat of another
-        mode.
+        PX4 rejects offboard without setpoints, and MAVSDK stops them at heartbeats of other modes.
         """
         while not self._flies_offboard():
             self._check(None, stop=stop)
@@ -435,7 +418,7 @@ class MavsdkLink:
             raise interfaces.LinkError(f"{what} failed: {_reason(error)}") from None
 
     def _deadline(self, timeout_s: float) -> int:
-        return self._clock.time_us() + int(timeout_s * US_PER_S)
+        return self._clock.time_us() + int(timeout_s * constants.US_PER_S)
 
     def _check(
         self, deadline_us: int | None, message: str = "", stop: threading.Event | None = None
@@ -458,7 +441,7 @@ class MavsdkLink:
         return None
 
     def _pause(self, seconds: float = POLL_S) -> None:
-        self._clock.sleep_until(self._clock.time_us() + int(seconds * US_PER_S))
+        self._clock.sleep_until(self._clock.time_us() + int(seconds * constants.US_PER_S))
 
     def _pause_until(
         self, due: interfaces.Due, deadline_us: int, stop: threading.Event | None = None
@@ -468,7 +451,7 @@ class MavsdkLink:
             self._pause()
         else:
             self._poll(
-                int(POLL_S * US_PER_S),
+                int(POLL_S * constants.US_PER_S),
                 lambda frames: due(frames) or self._over(deadline_us, stop=stop) is not None,
             )
 

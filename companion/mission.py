@@ -21,12 +21,11 @@ from airl_mav.scenario.model import LimitSettings, PilotSettings, WatchdogSettin
 from airl_mav.scenario.stand_alone import Start as PilotedStart
 from companion.camera import FrameSource
 from companion.dialects import ARDUPILOT
-from companion.guard import Guard
 from companion.interfaces import CAMERA_SILENT, LINK_LOST, STOP, TELEMETRY_FROZEN, LinkError
 from companion.limits import NOT_OURS, Limits
 from companion.mavsdk_link import MavsdkLink
 from companion.pilot import FRAME_WAIT_S, WAITING, Decided, Pilot
-from companion.watchdog import Watchdog
+from companion.watchdog import Guard, Watchdog
 
 PREPARE_TIMEOUT_S = 10.0
 """How long a flight controller may be silent when a mission begins [wall s]."""
@@ -84,27 +83,9 @@ def fly_mission(
 ) -> MissionResult:
     """Fly one mission on a connected link; never raises for what a flight can do.
 
-    Args:
-        link: Connected.
-        frames: The camera.
-        policy: The policy.
-        goal: North, east [m] from the start, and down where it has a height.
-        clock: Simulated time.
-        stop: Set from outside to land early.
-        abandon: Set from outside to end without landing: the vehicle has crashed. The link's own
-            event.
-        progress: Called with the name of each phase as it begins.
-        pilot_settings: Settings of the pilot.
-        watchdog_settings: Timeouts.
-        limit_settings: Limits of the flight.
-        guard: Guard of the deadlines.
-        latency: Source of t2, to fly as a slower computer.
-        compensator: Predicts what the policy sees; None: no prediction.
-        mount_pitch_up_rad: Pitch of the camera mount, up [rad].
-        mount_yaw_rad: Yaw of the camera mount, right [rad].
-        start: Whether this program arms, takes off and lands, a pilot hands over in flight, or the
-            vehicle is in Hold in the air before and after (hover).
-        decided: Callback for every decision, called when its setpoint is sent. Must not block.
+    `goal` is north, east [m] from the start, and down where it has a height. `stop`, set from
+    outside, lands early; `abandon`, the link's own event, ends without landing: the vehicle has
+    crashed. `progress` gets the name of each phase as it begins; `decided` must not block.
     """
     watchdog = Watchdog(link, clock, watchdog_settings)
     navigating = False
@@ -211,11 +192,7 @@ def check_camera(
     stop: threading.Event,
     compensator: Compensator | None = None,
 ) -> None:
-    """Check the first frame before take-off, if there is one before `stop`.
-
-    Raises:
-        UsageError: Policy or compensator cannot use it.
-    """
+    """Check the first frame, if one comes before `stop`; UsageError if the policy cannot use it."""
     if not isinstance(policy, CameraBound) and compensator is None:
         return
     for _ in range(math.ceil(FRAME_TIMEOUT_S / FRAME_WAIT_S)):

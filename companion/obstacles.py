@@ -59,7 +59,7 @@ def obstacle_distance(
 ) -> dict[str, Any]:
     """Return the fields of the message.
 
-    `depth_mm` (h, w) is a depth image, 0 = no return, up to `range_m` [m], `quaternion` (4,) the
+    `depth_mm` (h, w) is a depth image, 0 = no return, up to `range_m` [m]. `quaternion` (4,) is the
     vehicle's attitude, body to NED, `pitch_up_rad` that of the mount, `now_us` the time since the
     start.
     """

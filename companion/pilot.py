@@ -1,7 +1,7 @@
 """The decision loop: observe -> infer -> act, and hold; every step stamped.
 
-Sequential, as in the paper, or pipelined: then nothing is held, and the next decision begins as
-soon as the last one is ready. While a decision is computed, the last command keeps flying; where
+Sequential, as in the paper, or pipelined. Then nothing is held, and the next decision begins as
+soon as the last one is ready. While a decision is computed, the last command keeps flying. Where
 that is compensated, the policy sees what will be when its action is sent.
 """
 
@@ -22,7 +22,7 @@ from airl_mav.core.goals import Goal, goal_distance_m
 from airl_mav.latency.samplers import LatencySampler
 from airl_mav.latency.stamps import NO_STAMP, DecisionLog
 from airl_mav.policy.actions import Action, AnyAction, Policy, flyable, vertical_speed
-from airl_mav.policy.observation import InFlight, Kinematics, Observation, observe, views_of
+from airl_mav.policy.observation import Kinematics, Observation, observe, views_of
 from airl_mav.policy.observation_spec import MOST_FRAMES
 from airl_mav.prediction.compensator import Compensator
 from airl_mav.prediction.memory import DecisionMemory
@@ -101,10 +101,7 @@ class Pilot:
         self.memory = DecisionMemory(1) if compensator is None else compensator.memory
 
     def fly(self, goal: Goal, stop: Event) -> str:
-        """Decide until the goal is reached or the flight ends; return the reason in words.
-
-        `Limits.ending` describes a broken limit. Raises LinkError when setpoints are refused.
-        """
+        """Decide until the goal is reached or the flight ends; return the reason in words."""
         sequence = -1
         if self.limits is not None:
             self.limits.begin(self.clock.time_us())
@@ -220,22 +217,17 @@ class Pilot:
         age_us = np.array([age_of(seen, now_us)])
         if self.compensator is not None:
             images, states = self.compensator.foresee(
-                ONE,
-                image[None],
-                age_us,
-                np.array([now_us]),
-                Kinematics(state.position[None], state.velocity[None], state.quaternion[None]),
+                ONE, image[None], age_us, np.array([now_us]), state.rows(None)
             )
-            image = images[0]
-            state = Kinematics(states.position[0], states.velocity[0], states.quaternion[0])
-        told = self.memory.in_flight(age_us)
+            image, state = images[0], states.rows(0)
+        told = self.memory.in_flight(age_us).rows(0)
         earlier = tuple(self.earlier)
         views = views_of(frame, self.further)
         self.earlier.appendleft((image, state))
         self.further.appendleft({name: each.image for name, each in views.items()})
         return observe(
             *(image, frame.intrinsics, state, np.asarray(goal, np.float64)),
-            InFlight(told.latency_s[0], told.age_s[0], told.setpoint[0]),
+            told,
             earlier,
             views,
         )

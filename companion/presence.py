@@ -39,8 +39,7 @@ def computer_status(
 ) -> dict[str, Any]:
     """Return the fields of the message at a time since the start [µs].
 
-    `cores_percent` are the loads since the last message, of which the first 8 count, `ram_bytes`
-    memory in use and all, `celsius` is that of the processor, if known.
+    The loads of 8 cores count. `ram_bytes` is memory in use and all.
     """
     cores = [round(percent) for percent in cores_percent[:CORES]]
     temperature = NO_TEMPERATURE if celsius is None else max(-128, min(126, round(celsius)))

@@ -17,7 +17,7 @@ from airl_mav.core.cpu_quota import held_to
 from airl_mav.core.errors import FieldError
 from airl_mav.core.goals import Goal
 from airl_mav.core.provenance import describe_machine
-from airl_mav.flight.setup import Part, Setup
+from airl_mav.flight.record import Part, Setup
 from airl_mav.latency.samplers import LatencySampler, latency_generator
 from airl_mav.policy.actions import Policy
 from airl_mav.policy.learned import LearnedPolicy
@@ -30,12 +30,12 @@ from airl_mav.scenario.model import LimitSettings, PilotSettings, WatchdogSettin
 from airl_mav.scenario.stand_alone import StandAloneCompanion, check_companion
 from companion.camera import FrameSource, SharedFrames
 from companion.cameras.by_name import OpenCamera, open_named_camera
-from companion.guard import ThreadGuard
 from companion.mavsdk_link import MavsdkLink
 from companion.mission import MissionResult, check_camera, fly_mission
 from companion.obstacles import obstacles_told
 from companion.presence import present
 from companion.signing_proxy import signed
+from companion.watchdog import ThreadGuard
 
 if TYPE_CHECKING:
     from companion.black_box import BlackBoxRecorder
@@ -86,15 +86,15 @@ def prepare(asked: StandAloneCompanion) -> Mission:
     loaded = piloting.load_asked_policy(asked, policy, pilot.hold_s, asked.seed)
     sampler = injection.sampler(latency_generator(asked.seed, asked.latency_seed))
     vehicle, compensator = load_vehicle(asked.vehicle), None
-    if asked.tell_obstacles and vehicle.camera.kind != "depth":
-        accepted = "with a vehicle whose camera gives depth"
-        raise FieldError("tell_obstacles", asked.tell_obstacles, accepted)
-    if asked.tell_obstacles and vehicle.camera.projection == "fisheye":
-        accepted = "with a vehicle whose camera is a pinhole or a cylinder"
-        raise FieldError("tell_obstacles", asked.tell_obstacles, accepted)
-    if asked.tell_obstacles and vehicle.camera.yaw_deg != 0.0:
-        accepted = "with a vehicle whose camera looks ahead (camera.yaw_deg = 0)"
-        raise FieldError("tell_obstacles", asked.tell_obstacles, accepted)
+    needs = {
+        "gives depth": vehicle.camera.kind == "depth",
+        "is a pinhole or a cylinder": vehicle.camera.projection != "fisheye",
+        "looks ahead (camera.yaw_deg = 0)": vehicle.camera.yaw_deg == 0.0,
+    }
+    for need, met in needs.items():
+        if asked.tell_obstacles and not met:
+            accepted = f"with a vehicle whose camera {need}"
+            raise FieldError("tell_obstacles", asked.tell_obstacles, accepted)
     # What its card says is held against the camera's first frame, before take-off.
     if policy.card is None and (reason := camera_refused(policy, vehicle)):
         raise FieldError(
@@ -199,19 +199,9 @@ def fly_alone(
     waiting: Callable[[], None],
     progress: Callable[[str, int], None],
 ) -> MissionResult:
-    """Fly one mission with a real flight controller.
+    """Fly one mission with a real flight controller; `stop` lands, `abandon` does not.
 
-    Args:
-        asked: Connections of flight controller and camera.
-        mission: The mission.
-        stop: Set to land and end.
-        abandon: Set to end without landing.
-        waiting: Called before waiting for the flight controller.
-        progress: Called with each phase as it begins, and its time [µs].
-
-    Raises:
-        UsageError: An address is unusable, or the policy cannot use the camera.
-        LinkError: No flight controller is heard, or it was lost.
+    `waiting` is called before waiting for the flight controller. Raises UsageError or LinkError.
     """
     clock = WallClock(asked.speed)
 

@@ -28,10 +28,7 @@ _URL = re.compile(r"udp(?:in)?://(?P<host>[^:/]*):(?P<port>\d+)")
 
 @contextmanager
 def signed(url: str, key: Path | None) -> Iterator[str]:
-    """Yield the URL for MAVSDK: the original, or with a key that of a proxy before it.
-
-    A LinkError from it names the URL and rejected frames: a different key shows nothing else.
-    """
+    """Yield the URL for MAVSDK: the original, or that of a proxy that signs with a key."""
     if key is None:
         yield url
         return
@@ -49,10 +46,7 @@ class SigningProxy:
     """Passes a flight controller's verified frames to MAVSDK, and MAVSDK's, signed, back."""
 
     def __init__(self, url: str, key: Path) -> None:
-        """Bind and start the proxy of udpin://HOST:PORT, or raise UsageError.
-
-        Without a host only this machine can reach it (0.0.0.0: all in its networks).
-        """
+        """Bind and start the proxy of udpin://HOST:PORT, of this machine without a host."""
         found = _URL.fullmatch(url)
         if found is None:
             raise UsageError(f"--connect {url}: with a signing key: udpin://HOST:PORT")

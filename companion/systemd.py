@@ -63,10 +63,7 @@ def _watchdog_us(environment: Mapping[str, str]) -> int | None:
 
 @contextmanager
 def service(environment: Mapping[str, str] = os.environ) -> Iterator[ServiceManager]:
-    """Give the service manager, with watchdog pings from a thread while the context lasts.
-
-    They show that the interpreter runs; `companion.watchdog` checks that decisions come in time.
-    """
+    """Give the service manager, with watchdog pings from a thread while the context lasts."""
     with closing(ServiceManager(environment)) as manager, ExitStack() as alive:
         if manager.watchdog_us is not None:
             period_us = int(ALIVE_SHARE * manager.watchdog_us)

@@ -1,7 +1,7 @@
 """The companion's end of the turns when the scheduler is another process.
 
 A turn is granted by a MAVLink STATUSTEXT behind all telemetry, and given back by one behind all
-setpoints: both travel through MAVSDK in order. See docs/reference/lockstep-protocol.md. Frames
+setpoints. Both travel through MAVSDK in order. See docs/reference/lockstep-protocol.md. Frames
 arrive over ZeroMQ by the wall clock; the turn names the newest one that the companion may see.
 """
 
@@ -38,10 +38,7 @@ class TokenTurns:
     """Takes turns and gives them back. One flight; all but `_hear` on the companion's thread."""
 
     def __init__(self, stop: threading.Event, abandon: threading.Event, patience_s: float) -> None:
-        """Prepare; `patience_s` limits the wait for a turn or its frame [wall s, while running].
-
-        `stop` and `abandon` are set on commands to land or to end without landing.
-        """
+        """Prepare; `patience_s` limits the wait for a turn or its frame [wall s, while running]."""
         self.patience_s = patience_s
         self.frame = NO_FRAME
         """Sequence of the newest frame that has reached the companion by now."""
@@ -75,12 +72,7 @@ class TokenTurns:
     def sleep(
         self, wake_us: int, interrupt: threading.Event | None = None, poll: Poll | None = None
     ) -> None:
-        """Return the turn until simulated `wake_us` [µs]; see `conducted.Sleep`.
-
-        Raises:
-            Abandoned: No turn comes any more.
-            ValueError: The event is neither `stop` nor `frame_arrived`.
-        """
+        """Return the turn until simulated `wake_us`, or raise Abandoned; see `conducted.Sleep`."""
         del poll
         sent = 0 if self._link is None else self._link.setpoints_sent
         self._give_back(TurnBack(self._number, wake_us, sent, self._name_of(interrupt)))

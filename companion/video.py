@@ -16,7 +16,7 @@ from airl_mav.core.constants import US_PER_S
 
 GIMBAL_PORT: Final = 13_280
 """Where PX4 SITL's instance 0 sends what it forwards to a gimbal (px4-rc.mavlink), and the built-in
-flight controller of `airl-firmware`, too: a link that is fast enough, and is nobody else's here."""
+flight controller of `airl-firmware`, too. A link that is fast enough, and is nobody else's here."""
 
 LEAST_PX: Final = 320
 """A picture is enlarged by a whole factor until it is at least so wide, each pixel a square."""
@@ -42,10 +42,7 @@ class Watcher(NamedTuple):
 
 
 def picture_of(frame: Frame | FurtherImage, range_m: float) -> NDArray[np.uint8]:
-    """Return an image as a picture (h, w, 3) of even sides, at least `LEAST_PX` wide.
-
-    Depth up to `range_m` [m] is grey: near is bright, no return is black.
-    """
+    """Return an image as a picture (h, w, 3) of even sides; near is bright, no return black."""
     if frame.intrinsics.kind == "depth":
         shade = DARKEST + (255.0 - DARKEST) * nearness(frame.image, range_m)
         grey = np.where(frame.image == 0, 0.0, shade).astype(np.uint8)

@@ -42,7 +42,7 @@ VIDEO_STREAM_STATUS: Final = 270
 """Numbers of the messages that are sent to who asks for them (common.xml)."""
 
 STAMPED: Final = (CAMERA_INFORMATION, CAMERA_SETTINGS, STORAGE_INFORMATION, CAMERA_CAPTURE_STATUS)
-"""Those that say when they were sent."""
+"""Messages with a time stamp."""
 
 REQUEST_MESSAGE: Final = 512
 VIDEO_START_STREAMING: Final = 2502
@@ -93,7 +93,7 @@ Fields = dict[str, Any]
 
 @dataclass(frozen=True)
 class Stream:
-    """What is told of camera and video."""
+    """Descriptions of camera and video."""
 
     model: str
     """Of the camera; at most 31 characters are told."""
@@ -336,19 +336,7 @@ def show_video(
     stop: threading.Event,
     say: Callable[[str], None],
 ) -> int:
-    """Send a camera's video until `stop`; return the number of pictures.
-
-    Args:
-        camera: The camera.
-        watcher: Receiver of the video.
-        network: Where to announce it to ground stations; None: nowhere.
-        clock: For the stamps.
-        stop: Set to end.
-        say: Called with lines for the user.
-
-    Raises:
-        UsageError: The camera cannot be used, or there is none of that name.
-    """
+    """Send a camera's video until `stop`; return the number of pictures, or raise UsageError."""
     own = camera.own
     with closing(camera.open(clock)) as source:
         say(f"waiting for images of {camera.camera}")

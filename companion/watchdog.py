@@ -1,17 +1,19 @@
-"""Reactions to a silent decision loop, camera or link.
+"""Reactions to a silent decision loop, camera or link, and the guard that calls them in time.
 
 MAVSDK repeats the last setpoint at 20 Hz, so a hung policy would keep the vehicle moving and
 prevent the offboard-loss failsafe. Three lines of defence:
 
 1. A decision that is overdue zeroes the velocity.
 2. Still none: offboard is left, the flight controller holds.
-3. A policy holds Python's interpreter lock: a C-level timer ends the process (`guard.py`), and the
+3. A policy holds Python's interpreter lock: a C-level timer ends the process, and the
    offboard-loss failsafe acts.
 """
 
 from __future__ import annotations
 
+import faulthandler
 import threading
+from typing import Protocol
 
 from airl_mav.core.clock import Clock
 from airl_mav.core.constants import US_PER_S
@@ -110,7 +112,7 @@ class Watchdog:
         """Have the flight controller hold the vehicle where it is."""
         last = self._last
         # PX4 flies a velocity after body rates, or an attitude, up to half a second later, and the
-        # last of those until then: it must neither turn on, nor lean.
+        # last of those until then. It must neither turn on, nor lean.
         if isinstance(last, BodyRates):
             self._link.send_setpoint(BodyRates(0.0, 0.0, 0.0, last.thrust))
         elif isinstance(last, Attitude):
@@ -131,3 +133,68 @@ class Watchdog:
             f"watchdog at {now_us / US_PER_S:.2f} s: {what} ({self._activity}; last action "
             f"{age_s:.2f} s ago)"
         )
+
+
+POLL_US = 10_000
+"""Interval at which deadlines are checked [µs]."""
+
+CHECKS_PER_RESTART = 25
+"""Checks between two restarts of the timer that ends a starved process."""
+
+STDERR = 2
+"""File descriptor for the traceback of a process that is ended."""
+
+STARVED_S = 5.0
+"""The process ends when the thread has not run for this long [wall s]."""
+
+TURNING_STARVED_S = 1.0
+"""The same while an attitude or body rates are commanded: MAVSDK repeats them meanwhile, and the
+flight controller's failsafe can act only when it no longer does [wall s]."""
+
+
+class Guard(Protocol):
+    """Calls a watchdog's `look` in time."""
+
+    def start(self, watchdog: Watchdog) -> None:
+        """Begin to watch."""
+        ...
+
+    def stop(self) -> None:
+        """Stop watching; harmless when it never began."""
+        ...
+
+
+class ThreadGuard:
+    """Checks from a thread, and ends the process when that thread is starved."""
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self._done = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def start(self, watchdog: Watchdog) -> None:
+        """Begin to watch."""
+        self._thread = threading.Thread(
+            target=self._run, args=(watchdog,), name="watchdog", daemon=True
+        )
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Stop watching; harmless when it never began."""
+        self._done.set()
+        if self._thread is not None:
+            self._thread.join()
+        faulthandler.cancel_dump_traceback_later()
+
+    def _run(self, watchdog: Watchdog) -> None:
+        try:
+            while not self._done.is_set():
+                starved_s = STARVED_S if watchdog.by_velocity else TURNING_STARVED_S
+                faulthandler.dump_traceback_later(starved_s, exit=True, file=STDERR)
+                for _ in range(CHECKS_PER_RESTART):
+                    if self._done.is_set():
+                        return
+                    watchdog.look()
+                    self._clock.sleep_until(self._clock.time_us() + POLL_US)
+        finally:
+            faulthandler.cancel_dump_traceback_later()

@@ -45,6 +45,11 @@ class FrameServer(Protocol):
     endpoint: str
     """Where subscribers connect."""
 
+    @property
+    def awaited(self) -> bool:
+        """Whether somebody waits for the next frame: it must not come late."""
+        ...
+
     def publish(self, frame: Frame) -> None:
         """Offer a frame, without waiting for anybody."""
         ...
@@ -351,16 +356,18 @@ class Firmware:
         if simulation.recorder is not None and self.epoch_ns is not None:
             simulation.recorder.began_tick(due_us, began_us, self.slipped_us - slipped_us)
         receive(began_us)
-        # Before the tick, while its time is now: after it the state lies one tick ahead.
-        if self._camera is not None:
-            simulation.capture_due(
-                self._camera.publish if self.on_frame is None else self._show_and_publish
-            )
+        camera = self._camera
+        if camera is not None:
+            # Before the tick, while its time is now: after it the state lies one tick ahead.
+            publish = camera.publish if self.on_frame is None else self._show_and_publish
+            simulation.capture_due(simulation.time_us, publish)
         until_us = 0.0 if self.on_tick is not None else self._pacing.quiet_until_us
-        if self._camera is not None:
+        if camera is not None and camera.awaited:
             until_us = min(until_us, simulation.next_frame_us)
         log, internals = self._flight_log, simulation.autopilot.internals
-        simulation.advance(until_us)
+        simulation.advance(until_us, self._pacing.arrivals)
+        if camera is not None and len(simulation.truths) > 1:
+            simulation.capture_due(simulation.time_us - TICK_US, publish)
         if log is not None and internals is not None:
             log.after_ticks(simulation.flown, simulation.truths, internals.state())
         flight_stack.send(simulation.time_us, simulation.flown)

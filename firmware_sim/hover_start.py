@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, NamedTuple
 from airl_mav.core.constants import (
     TAKEOFF_REACHED_M,
     TAKEOFF_REACHED_M_S,
-    TICK_HZ,
     US_PER_S,
 )
 from airl_mav.core.frames import Geodetic
@@ -29,8 +28,8 @@ GROUND_LIMIT_S = 30.0
 CLIMB_LIMIT_M_S = 0.5
 """Minimum mean speed of the climb [m/s]; PX4's take-off climbs at 1.5 m/s."""
 
-LOOK_TICKS = TICK_HZ // 10
-"""Ticks between two looks at the vehicle's state."""
+LOOK_US = US_PER_S // 10
+"""Time between two looks at the vehicle's state [µs]."""
 
 ARM_RETRY_US = US_PER_S
 """Time between two requests to arm, while pre-arm checks fail [µs]."""
@@ -76,10 +75,11 @@ class HoverStart(NamedTuple):
     def _climb(self, simulation: Simulation, autopilot: BuiltinAutopilot, until_us: int) -> bool:
         """Arm and climb; return whether the altitude is reached before `until_us` [µs]."""
         start_m, arm_us = 0.0, simulation.time_us
+        simulation.plant.hold_obstacles()
         while simulation.time_us < until_us:
-            for _ in range(LOOK_TICKS):
-                simulation.plant.begin()  # Moving obstacles stay where their tours begin.
-                simulation.tick()
+            look_us = simulation.time_us + LOOK_US
+            while simulation.time_us < look_us:
+                simulation.advance(look_us)
             flight, estimate = autopilot.flight, autopilot.estimator.estimate()
             down_m, down_m_s = estimate.position.item(2), estimate.velocity.item(2)
             if flight.phase is Phase.STANDBY and simulation.time_us >= arm_us:

@@ -25,6 +25,19 @@ PR_SET_TIMERSLACK = 29
 """Option of prctl(2) (linux/prctl.h): how late the kernel may wake the calling thread [ns]."""
 
 
+class Arrivals(Protocol):
+    """Messages to the flight controller whose times are known ahead."""
+
+    @property
+    def next_us(self) -> float:
+        """Simulated time of the next one [µs]; inf = none."""
+        ...
+
+    def arrive(self, tick_us: int) -> None:
+        """Let the flight controller receive everything up to simulated `tick_us` [µs]."""
+        ...
+
+
 class Pacing(Protocol):
     """Decides when the next tick runs."""
 
@@ -43,7 +56,12 @@ class Pacing(Protocol):
 
     @property
     def quiet_until_us(self) -> float:
-        """Simulated time before which nothing can arrive [µs]; 0 = at any tick."""
+        """Simulated time before which only `arrivals` can arrive [µs]; 0 = at any tick."""
+        ...
+
+    @property
+    def arrivals(self) -> Arrivals | None:
+        """What arrives before then; None = nothing."""
         ...
 
     def restart(self, tick_us: int) -> None:
@@ -69,6 +87,7 @@ class WallPacing:
     """Runs every tick at its wall time."""
 
     quiet_until_us = 0.0
+    arrivals = None
 
     def __init__(self, speed: float) -> None:
         """Take the speed: simulated seconds per wall second, > 0.
@@ -152,6 +171,7 @@ class Unpaced:
     epoch_ns = None
     slipped_us = 0
     quiet_until_us = 0.0
+    arrivals = None
 
     def __init__(self) -> None:
         self.clock = SimClock()

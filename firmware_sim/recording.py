@@ -31,7 +31,7 @@ class SetpointLog:
         self._accepted: list[tuple[int, Wire]] = []
         self._motor_us: list[int] = []
         """`NO_STAMP` of those that are not flown yet."""
-        self._under_way: list[list[int]] = []
+        self._under_way: list[tuple[int, int, int]] = []
         """First and last setpoint that were taken in a tick, and after how many more they are
         flown: of body rates that is sooner than of a velocity that came before them."""
         self._taken = 0
@@ -40,11 +40,6 @@ class SetpointLog:
     def fresh(self) -> bool:
         """Whether setpoints were accepted that no tick has taken yet."""
         return len(self._accepted) > self._taken
-
-    @property
-    def pending(self) -> bool:
-        """Whether setpoints were accepted that no motor commands reflect yet."""
-        return bool(self._under_way) or self.fresh
 
     def accepted(self, setpoint: Wire, time_us: int) -> None:
         """Note an accepted setpoint, read from `time_us` on [µs]."""
@@ -55,17 +50,16 @@ class SetpointLog:
 
     def take(self, ticks_to_motors: int) -> None:
         """Note that the coming tick takes what was accepted, to be flown so many ticks later."""
-        self._under_way.append([self._taken, len(self._accepted), ticks_to_motors])
+        self._under_way.append((self._taken, len(self._accepted), ticks_to_motors))
         self._taken = len(self._accepted)
 
-    def ticked(self, time_us: int) -> None:
-        """Note that motor commands were computed, at `time_us` [µs]."""
-        for entry in self._under_way:
-            first, end, ticks = entry
-            if ticks <= 0:
-                self._motor_us[first:end] = [time_us] * (end - first)
-            entry[2] -= 1
-        self._under_way = [entry for entry in self._under_way if entry[2] >= 0]
+    def flown(self, times_us: Sequence[int]) -> None:
+        """Note when motor commands were computed in the newest ticks (n,) [µs]."""
+        for first, end, ticks in self._under_way:
+            if ticks < len(times_us):
+                self._motor_us[first:end] = [times_us[max(0, ticks)]] * (end - first)
+        left = ((first, end, ticks - len(times_us)) for first, end, ticks in self._under_way)
+        self._under_way = [entry for entry in left if entry[2] >= 0]
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return accepted_us (n,), motor_us (n,), setpoint float32 (n, 4)."""
@@ -133,10 +127,10 @@ class FlightRecorder:
         if slipped_us:
             self._slips.append((began_us, slipped_us))
 
-    def before_controls(self) -> None:
-        """Note that the flight controller is about to take a sample."""
+    def before_controls(self, ticks: int = 0) -> None:
+        """Note that the flight controller takes what was accepted, after so many further ticks."""
         if self._internals is not None and self.setpoints.fresh:
-            self.setpoints.take(self._internals.ticks_to_motors)
+            self.setpoints.take(self._internals.ticks_to_motors + ticks)
 
     def flown(self, truths: Record, flown: Record, first_us: int) -> None:
         """Take the newest ticks.
@@ -146,11 +140,8 @@ class FlightRecorder:
             flown: (n,) log of the flight controller; empty = nobody can look into it.
             first_us: When the first of them had its motor commands [µs].
         """
-        setpoints, times = self.setpoints, truths["time_us"].tolist()
-        for time_us in times:
-            if not setpoints.pending:
-                break
-            setpoints.ticked(first_us + time_us - times[0])
+        times = truths["time_us"].tolist()
+        self.setpoints.flown([first_us + time_us - times[0] for time_us in times])
         for k in self._trajectory.extend(times, truths["power_w"].tolist(), truths["motion"]):
             if self._internals is not None:
                 self._estimates.append(flown["state"][k, :RATES].copy())

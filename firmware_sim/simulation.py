@@ -25,7 +25,7 @@ from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.parameter_store import Keeper, Parameters
 from firmware_sim.engine.kinematics import POSITION, QUATERNION, RATES, VELOCITY
 from firmware_sim.engine.record import FLOWN_TICK, TRUE_TICK
-from firmware_sim.engine.ticks import COLLIDED, FUSE, log_flown_record, log_record
+from firmware_sim.engine.ticks import ALIGN, COLLIDED, FUSE, log_flown_record, log_record
 from firmware_sim.faults.camera import FailingCamera
 from firmware_sim.faults.controller import FailingParts
 from firmware_sim.faults.injection import ClientFaults
@@ -33,14 +33,19 @@ from firmware_sim.faults.timeline import FaultTimeline
 from firmware_sim.flight_controller import FlightController
 from firmware_sim.hover_start import HoverStart
 from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth
+from firmware_sim.pacing import Arrivals
 from firmware_sim.plant.camera_server import SimulatedCamera
 from firmware_sim.plant.onboard_camera import CameraMaker, OnboardCamera
 from firmware_sim.plant.plant import Plant
 from firmware_sim.recording import FlightRecorder, fault_arrays
 from firmware_sim.simulation_snapshot import SimulationSnapshot
 
-MOST_TICKS = 250
-"""Ticks that are flown at a time, at most: a second."""
+MOST_TICKS = 25
+"""Ticks that are flown at a time, at most: streams at 10 Hz and below are sent in between."""
+
+
+_ENDS = (COLLIDED, ALIGN)
+"""Events that end a stretch whatever follows from them."""
 
 
 @dataclass(frozen=True)
@@ -189,10 +194,11 @@ class Simulation:
         """Run autopilot, then plant, for one tick."""
         self.advance(self.time_us)
 
-    def advance(self, until_us: float) -> None:
+    def advance(self, until_us: float, arrivals: Arrivals | None = None) -> None:
         """Fly ticks as long as they begin before simulated `until_us` [µs], and one at least.
 
-        It may end earlier: when something is detected, or has to be decided.
+        It may end earlier: when something is detected, or has to be decided. `arrivals` arrive
+        between two of the ticks; None = nothing does.
         """
         plant, recorder, autopilot = self.plant, self.recorder, self.autopilot.internals
         first_us = self._clock.time_us()
@@ -203,7 +209,7 @@ class Simulation:
         if autopilot is None or not self._is_compiled(autopilot):
             done = self._tick_by_python(autopilot)
         else:
-            done = self._stretch(autopilot, until_us)
+            done = self._stretch(autopilot, until_us, arrivals)
         self.time_us = plant.time_us
         self.truths = self._truths[:done]
         self.flown = self._flown[: 0 if autopilot is None else done]
@@ -225,49 +231,63 @@ class Simulation:
                 autopilot.take(self._sample)  # as compiled ticks do
         return 1
 
-    def _stretch(self, autopilot: BuiltinAutopilot, until_us: float) -> int:
+    def _stretch(
+        self, autopilot: BuiltinAutopilot, until_us: float, arrivals: Arrivals | None
+    ) -> int:
         """Fly compiled ticks; return how many."""
         autopilot.take(self._sample)
-        plant, done = self.plant, 0
-        most = max(1, math.ceil(min((until_us - self.time_us) / TICK_US, MOST_TICKS)))
+        plant, done, time_us = self.plant, 0, self.time_us
+        most = max(1, math.ceil(min((until_us - time_us) / TICK_US, MOST_TICKS)))
+        arrives_us = math.inf if arrivals is None else arrivals.next_us
         while done < most:
-            due_us = autopilot.decide_if_due()
-            ticks = max(1, math.ceil(min((due_us - plant.time_us) / TICK_US, most - done)))
+            if done and arrivals is not None and arrives_us <= time_us:
+                arrivals.arrive(time_us)
+                arrives_us = arrivals.next_us
+                if self.recorder is not None:
+                    self.recorder.before_controls(done)
+            due_us = min(autopilot.decide_if_due(), arrives_us)
+            ticks = max(1, math.ceil(min((due_us - time_us) / TICK_US, most - done)))
             flown, event = self._glide(autopilot, done, done + ticks)
             done += flown
-            self._sample = plant.newest()
-            changed = autopilot.flown(self._sample)
+            time_us += flown * TICK_US
+            changed = autopilot.flown(plant.newest)
             # After what Python fuses, other aids may be in use.
-            if changed or event == COLLIDED or not autopilot.compiled:
+            if changed or event in _ENDS or (event == FUSE and not autopilot.compiled):
                 break
+        self._sample = autopilot.sample or self._sample
         return done
 
     def _glide(self, autopilot: BuiltinAutopilot, first: int, end: int) -> tuple[int, int]:
         """Fly ticks at a constant demand into the logs; return how many, and the last event."""
-        plant, record, done, event = self.plant, autopilot.record, first, FUSE
-        while event == FUSE and done < end:
-            flown, event = plant.glide(
-                record, end - done, self._truths[done:end], self._flown[done:end]
-            )
-            done += flown
-            if event == FUSE:
-                done += 1
-                if autopilot.fuse(plant.newest(), record["left"].item(0)) or record["detected"][0]:
-                    break
-        return done - first, event
+        plant, record = self.plant, autopilot.record
+        flown, event = plant.glide(
+            record, end - first, self._truths[first:end], self._flown[first:end]
+        )
+        if event == FUSE:
+            flown += 1
+            autopilot.fuse(plant.newest(), record["left"].item(0))
+        return flown, event
 
     @property
     def next_frame_us(self) -> float:
         """When the camera exposes its next frame [µs]; inf on an endless floor."""
         return math.inf if self._camera is None else self._camera.next_us
 
-    def capture_due(self, publish: Callable[[Frame], None]) -> None:
-        """Hand a depth frame to `publish` when the camera is due; an endless floor has none."""
-        camera = self._camera
-        if camera is not None and self.time_us >= camera.next_us:
-            row = self.plant.motion
+    def capture_due(self, until_us: int, publish: Callable[[Frame], None]) -> None:
+        """Publish the frames that are due by simulated `until_us` [µs], now or in the newest ticks.
+
+        An endless floor has none.
+        """
+        camera, truths = self._camera, self.truths
+        while camera is not None and camera.next_us <= until_us:
+            time_us, row = self.time_us, self.plant.motion
+            if time_us > until_us:
+                k = truths["time_us"].searchsorted(camera.next_us)
+                time_us, row = truths["time_us"].item(k), truths["motion"][k].copy()
+                if time_us > until_us:
+                    break
             motion = Motion(row[POSITION], row[QUATERNION], row[VELOCITY], row[RATES])
-            camera.offer(self.time_us, motion, publish)
+            camera.offer(time_us, motion, publish)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return what was recorded so far, by the names of its file (docs/run-folder.md)."""

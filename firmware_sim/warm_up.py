@@ -89,7 +89,7 @@ def _fly(vehicle: VehicleProfile, plant: PlantName, arena: Arena | None) -> None
         for _ in range(LONGEST_TICKS):
             simulation.tick()
             server.send(simulation.time_us)
-            simulation.capture_due(lambda _frame: None)
+            simulation.capture_due(simulation.time_us, lambda _frame: None)
             if autopilot.arm(force=False) == 0:
                 autopilot.takeoff(2.0)
                 armed += 1

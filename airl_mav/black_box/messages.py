@@ -1,20 +1,22 @@
-"""Topics and messages of a black box.
+"""Topics and messages of a black box, and their bytes.
 
 Messages are JSON with a JSON Schema, made of the classes here, for any reader of MCAP (Foxglove,
 `mcap cat`, pandas). Images and texts have Foxglove's schemas
 (https://docs.foxglove.dev/docs/visualization/message-schemas/introduction). Times `*_us` count from
-the companion's start [µs]; world frames are NED from the start of the flight, bodies FRD.
+the companion's start [µs]. World frames are NED from the start of the flight, bodies FRD.
 """
 
 from __future__ import annotations
 
 import base64
+import json
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, TypeAdapter
 
 from airl_mav.core.clock import NS_PER_US
 from airl_mav.core.constants import US_PER_S
@@ -72,16 +74,9 @@ class Telemetry:
 
 
 @dataclass(frozen=True)
-class Truth:
+class Truth(Telemetry):
     """What the simulator knows of the vehicle; in files that are exported from a run."""
 
-    time_us: Microseconds
-    position: Vector3
-    """[m]."""
-    velocity: Vector3
-    """[m/s]."""
-    quaternion: Vector4
-    """w, x, y, z, body to world."""
     power_w: Number
     """Electrical power, without the companion computer's."""
 
@@ -243,10 +238,7 @@ ENCODINGS: dict[str, tuple[str, int]] = {
 
 
 def image_message(image: NDArray[Any], unix_us: int, camera: str = "camera") -> RawImage:
-    """Return the message of a depth (h, w) [mm] or colour (h, w, c) image at a calendar time [µs].
-
-    The topic of an additional camera is the main one, a slash and its name.
-    """
+    """Return the message of a depth (h, w) [mm] or colour (h, w, c) image at calendar time."""
     height, width, *channels = image.shape
     encoding = "mono16" if not channels else "rgb8" if channels == [3] else "mono8"
     rows = np.ascontiguousarray(image, ENCODINGS[encoding][0])
@@ -273,3 +265,64 @@ def time_of(unix_us: int) -> Time:
     """Return a calendar time [µs since 1970] as Foxglove's schemas have it."""
     seconds, rest_us = divmod(unix_us, US_PER_S)
     return Time(seconds, rest_us * NS_PER_US)
+
+
+UNKNOWN = "null: not known"
+
+
+def foxglove_schema(kind: type[Any]) -> dict[str, Any]:
+    """Return the JSON schema of a message class; a description says which fields are nullable.
+
+    Foxglove's parser (packages/mcap-support/src/parseJsonSchema.ts in foxglove/studio) requires one
+    plain `type` per property, one `items` per array and base64 bytes.
+    """
+    schema = TypeAdapter(kind).json_schema()
+    return _plain(schema, schema.get("$defs", {}))
+
+
+def _plain(schema: Mapping[str, Any], named: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a schema without references, alternatives and tuples."""
+    if "$ref" in schema:
+        return _plain(named[schema["$ref"].removeprefix("#/$defs/")], named)
+    if "anyOf" in schema:
+        known = [each for each in schema["anyOf"] if each.get("type") != "null"]
+        return {**_plain(known[0], named), "description": UNKNOWN}
+    plain = {key: value for key, value in schema.items() if key not in ("$defs", "prefixItems")}
+    if "properties" in schema:
+        plain["properties"] = {
+            name: _plain(each, named) for name, each in schema["properties"].items()
+        }
+    if schema.get("type") == "array":
+        items = schema.get("items") or schema["prefixItems"][0]
+        plain["items"] = _plain(items, named)
+    return plain
+
+
+JSON = "json"
+
+
+class Channel(NamedTuple):
+    """What a reader needs to understand the messages of a topic; the terms are MCAP's."""
+
+    topic: str
+    schema_name: str
+    schema_encoding: str
+    schema: bytes
+    encoding: str
+
+
+def _channel(kind: type[Message]) -> Channel:
+    schema = json.dumps(foxglove_schema(kind)).encode()
+    return Channel(TOPICS[kind], SCHEMAS[kind], "jsonschema", schema, JSON)
+
+
+CHANNELS = {kind: _channel(kind) for kind in TOPICS}
+"""Of our own messages, by their kind."""
+
+_ADAPTERS: dict[type[Message], TypeAdapter[Any]] = {kind: TypeAdapter(kind) for kind in TOPICS}
+
+
+def encoded(message: Message) -> tuple[Channel, bytes]:
+    """Return the channel and the bytes of a message of ours."""
+    kind = type(message)
+    return CHANNELS[kind], _ADAPTERS[kind].dump_json(message)

@@ -15,22 +15,7 @@ from mcap.records import Message as Record
 from mcap.stream_reader import CRCValidationError, StreamReader
 from pydantic import TypeAdapter, ValidationError
 
-from airl_mav.black_box.channels import JSON
-from airl_mav.black_box.messages import (
-    TOPICS,
-    Command,
-    Decision,
-    End,
-    Latency,
-    Log,
-    Message,
-    Phase,
-    RawImage,
-    Resources,
-    Status,
-    Telemetry,
-    Truth,
-)
+from airl_mav.black_box.messages import JSON, TOPICS, Message
 from airl_mav.black_box.writing import METADATA, RUN
 from airl_mav.core.errors import UsageError
 
@@ -40,20 +25,7 @@ _RECORD_BYTES = 64 * 2**20
 _TORN = (McapError, struct.error, UnicodeDecodeError, ValidationError)
 """What a file that ends in the midst of a record, or is damaged there, leads to."""
 
-M = TypeVar(
-    "M",
-    Decision,
-    Telemetry,
-    Truth,
-    Command,
-    Latency,
-    Status,
-    Resources,
-    Phase,
-    End,
-    RawImage,
-    Log,
-)
+M = TypeVar("M", bound=Message)
 
 
 @dataclass
@@ -63,7 +35,7 @@ class BlackBox:
     path: Path
     run: dict[str, Any]
     """What flew, as `run.json` has it."""
-    messages: dict[type[Message], list[Any]] = field(default_factory=dict)
+    messages: dict[type[Any], list[Any]] = field(default_factory=dict)
     whole: bool = False
     """Whether it was closed, or ends somewhere: the program, the computer or the power failed."""
     damaged: bool = False

@@ -11,8 +11,7 @@ from typing import IO, Any
 
 from mcap.writer import CompressionType, IndexType, Writer
 
-from airl_mav.black_box.channels import Channel, encoded
-from airl_mav.black_box.messages import Message
+from airl_mav.black_box.messages import Channel, Message, encoded
 from airl_mav.core.clock import NS_PER_US
 
 METADATA = "airl-mav"
@@ -26,11 +25,7 @@ class McapFile:
     """An MCAP file with the messages of a flight."""
 
     def __init__(self, file: IO[bytes], run: Mapping[str, Any], *, in_chunks: bool = True) -> None:
-        """Begin an empty file; `run` is the content of `run.json`.
-
-        Chunks are compressed and indexed, so that viewers can seek; without chunks every message is
-        readable as soon as it is on the disk.
-        """
+        """Begin an empty file; chunks are compressed and indexed, but lost by a crash."""
         self._writer = Writer(
             file,
             compression=CompressionType.ZSTD if in_chunks else CompressionType.NONE,

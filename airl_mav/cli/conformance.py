@@ -71,11 +71,7 @@ OPTIONS = ConformanceOptions
 
 
 def run(options: ConformanceOptions, console: Console | None = None) -> int:
-    """Check a vehicle and print the result.
-
-    Returns 0 if it conforms, 1 for a failed check or a figure outside its tolerance, 130 after
-    Ctrl-C and landing.
-    """
+    """Check a vehicle and print the result; return 0, 1 unless it conforms, or 130."""
     from airl_mav.conformance.report import check_table, line_text, step_table
     from airl_mav.conformance.run import check_conformance
     from airl_mav.conformance.steps import STEP_NAMES

@@ -8,19 +8,11 @@ from typing import TYPE_CHECKING, Any
 from pydantic import Field
 from rich.console import Console
 
-from airl_mav.cli.gate import Gate, leave, requirements_of
+from airl_mav.cli.shared_options import Gate, leave, requirements_of
 from airl_mav.cli.telling import Telling, Voice
 from airl_mav.core.fields import quantity
+from airl_mav.scenario import model
 from airl_mav.scenario.aircraft import Aircraft
-from airl_mav.scenario.model import (
-    GREATEST_EPISODES,
-    ONBOARD_COMPUTER,
-    REFERENCE_COMPUTER,
-    Decisions,
-    Flights,
-    Lateness,
-    LevelName,
-)
 
 if TYPE_CHECKING:
     from airl_mav.experiments.experiment import Experiment, ExperimentRun
@@ -34,24 +26,26 @@ COMMANDS = {"matrix": "airl evaluate", "degradation": "airl degrade"}
 
 def episodes(description: str, default: int, least: int = 1) -> Any:
     """Return a number of episodes as a field."""
-    return quantity(description, "1", ge=least, le=GREATEST_EPISODES, default=default)
+    return quantity(description, "1", ge=least, le=model.GREATEST_EPISODES, default=default)
 
 
-class ExperimentOptions(Telling, Flights, Lateness, Decisions, Aircraft):
+class ExperimentOptions(Telling, model.Flights, model.Lateness, model.Decisions, Aircraft):
     """What all of them can be asked for; the level is that of the most flights a second."""
 
-    level: LevelName = Field(default="gym", description=Flights.model_fields["level"].description)
+    level: model.LevelName = Field(
+        default="gym", description=model.Flights.model_fields["level"].description
+    )
 
 
 class OnboardOptions(Gate, ExperimentOptions):
     """A policy on an onboard computer, compared with a reference."""
 
     computer: str = Field(
-        default=ONBOARD_COMPUTER,
+        default=model.ONBOARD_COMPUTER,
         description="onboard computer: a shipped profile, or a path to a .toml",
     )
     reference: str = Field(
-        default=REFERENCE_COMPUTER,
+        default=model.REFERENCE_COMPUTER,
         description="computer that the onboard computer is compared with: a shipped profile, or a"
         " path",
     )
@@ -70,10 +64,7 @@ def fly_and_show(
     gate: Gate = NOTHING_REQUIRED,
     telling: Telling = FOR_PEOPLE,
 ) -> tuple[int, ExperimentRun]:
-    """Fly the rest of an experiment and show the comparison; return exit status and what was flown.
-
-    The status is 0, 1 (workers lost), 3 to 5 (verdict) or 130 (Ctrl-C).
-    """
+    """Fly the rest of an experiment and show it; return 0, 1, 3 to 5 or 130, and what flew."""
     # Imported here and below: options need no simulator, and no flight waits for figures.
     from airl_mav.experiments.experiment import run_experiment
     from airl_mav.experiments.live import EXIT_CODES

@@ -9,7 +9,7 @@ from pydantic import Field
 from rich.console import Console
 
 from airl_mav.cli.options import POSITIONAL, check_installed
-from airl_mav.cli.recordings import folder_of
+from airl_mav.cli.shared_options import TrustArenas, folder_of
 from airl_mav.core.console import new_console
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity
@@ -51,10 +51,7 @@ class ExportLogOptions(ProfileModel):
         default=False, description="publish one flight live on the loopback address, write nothing"
     )
     port: int = quantity("TCP port of --stream", "1", ge=1, le=GREATEST_PORT, default=FOXGLOVE_PORT)
-    trust: bool = Field(
-        default=False,
-        description="run the arena generators that the runs name: code of whoever made the folder",
-    )
+    trust: TrustArenas = False
 
 
 OPTIONS = ExportLogOptions

@@ -16,16 +16,7 @@ from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.core.files import replace_file
 from airl_mav.core.progress import RichProgress
 from airl_mav.core.provenance import provenance, usable_cores
-from airl_mav.experiments.fault_matrix import (
-    Cell,
-    cell_text,
-    fly_matrix,
-    markdown,
-    resumed,
-    save,
-    vehicle_digest,
-    with_cells,
-)
+from airl_mav.experiments import fault_matrix
 from airl_mav.faults.catalogue import CASES, MATRIX_PHASES
 from airl_mav.faults.kinds import LINKS, PROCESSES, Phase
 from airl_mav.faults.model import Fault
@@ -92,30 +83,35 @@ def run(options: FaultsOptions, console: Console | None = None) -> int:
     out = options.out or Path("runs") / f"{utc_now():%Y%m%dT%H%M%SZ}-faults"
     out.mkdir(parents=True, exist_ok=True)
     file = out / "faults.json"
-    matrix = resumed(file, provenance("airl faults"), vehicle_digest(vehicle))
-    done: list[Cell] = []
+    matrix = fault_matrix.resumed(
+        file, provenance("airl faults"), fault_matrix.vehicle_digest(vehicle)
+    )
+    done: list[fault_matrix.Cell] = []
     with RichProgress(console) as progress:
         bar = progress.bar("faults", len(faults) * len(phases) * len(seeds), unit="flights")
 
-        def flown(cell: Cell) -> None:
+        def flown(cell: fault_matrix.Cell) -> None:
             done.append(cell)
-            save(with_cells(matrix, done), file)
+            fault_matrix.save(fault_matrix.with_cells(matrix, done), file)
             bar.update(completed=len(done) * len(seeds))
 
-        cells = fly_matrix(
+        cells = fault_matrix.fly_matrix(
             vehicle, faults, phases, seeds, workers=workers, known=matrix.cells, flown=flown
         )
         bar.close()
-    replace_file(out / "faults.md", markdown(cells).encode())
+    replace_file(out / "faults.md", fault_matrix.markdown(cells).encode())
     print_table(table_of(faults, phases, cells), console, wrap=True)
     console.print(f"{out}", soft_wrap=True)
     return EXIT_NOT_MET if any(cell.unexpected for cell in cells) else 0
 
 
-def table_of(faults: Sequence[str], phases: Sequence[Phase], cells: Sequence[Cell]) -> TableView:
+def table_of(
+    faults: Sequence[str], phases: Sequence[Phase], cells: Sequence[fault_matrix.Cell]
+) -> TableView:
     """Return the matrix as a table, a fault a row, for a terminal of any width."""
     rows = tuple(
-        (fault, *(cell_text(cell) for cell in cells if cell.fault == fault)) for fault in faults
+        (fault, *(fault_matrix.cell_text(cell) for cell in cells if cell.fault == fault))
+        for fault in faults
     )
     columns = (Column("fault", number=False), *(Column(p, number=False) for p in phases))
     note = "!: a flight ended otherwise than documented. In brackets: fastest touch-down."

@@ -62,11 +62,7 @@ _FIELD = re.compile(r"\b[a-z0-9]+(?:_[a-z0-9]+)+\b")
 
 
 def read_options(model: type[Options], prog: str, words: Sequence[str]) -> Options:
-    """Read a command line into its model, whose docstring is the help.
-
-    A first word that ends in .toml is a file of defaults, such as a scenario. Raises UsageError for
-    unusable values or files, or tyro's SystemExit.
-    """
+    """Read a command line, or a first word .toml, into its model, whose docstring is the help."""
     words = _with_values(model, words)
     held: dict[str, Any] = {}
     file = _scenario_file(model, words)
@@ -234,9 +230,9 @@ def _help(field: FieldInfo) -> str:
 def run_command(prog: str, module: str, words: Sequence[str] | None = None) -> NoReturn:
     """Run the command of a module and exit with its status.
 
-    The module has `OPTIONS`, the model of its options; `run(options) -> exit status`, which raises
-    UsageError for input that cannot be used; and optionally `EXTRAS`, what it needs beside the
-    simulator. Usage errors become one line and exit status 2, a machine that fails one line and 1.
+    The module has `OPTIONS`, the model of its options, `run(options) -> exit status`, and
+    optionally `EXTRAS`, what it needs beside the simulator. Errors become one line and exit status
+    2 or 1.
     """
     words = sys.argv[1:] if words is None else words
     threading.excepthook = _thread_failed
@@ -264,10 +260,7 @@ def run_command(prog: str, module: str, words: Sequence[str] | None = None) -> N
 
 
 def carry_out(prog: str, module: str, words: Sequence[str], **more: Any) -> int:
-    """Read a command line and run its command; return the exit status.
-
-    `more` goes to the module's `run`. Raises UsageError, naming the option, or tyro's SystemExit.
-    """
+    """Read a command line and run its command, which gets `more`; return the exit status."""
     if module.rpartition(".")[2] not in LIGHT:
         # Before the import: it would fail for want of them.
         check_installed("sim")

@@ -56,11 +56,7 @@ OPTIONS = ProfileOptions
 
 
 def run(options: ProfileOptions, console: Console | None = None) -> int:
-    """Measure, print the report, and write the profile.
-
-    Returns 0, 1 if it broke off, or 130 after Ctrl-C. Files are written with 0, and with 130 if
-    Ctrl-C ended the soak.
-    """
+    """Measure, print the report, and write the profile unless it broke off; return 0, 1 or 130."""
     console = console or new_console()
     if options.level == "sitl":
         check_installed("sim")

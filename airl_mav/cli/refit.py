@@ -13,7 +13,7 @@ from airl_mav.cli.options import POSITIONAL, check_installed
 from airl_mav.core.console import new_console
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel
-from airl_mav.report.table import NONE, Column, TableView, print_table
+from airl_mav.report.table import NONE, Column, TableView, columns_of, print_table
 
 if TYPE_CHECKING:
     from airl_mav.refitting.quantity import FittedQuantity
@@ -105,13 +105,7 @@ def run(options: RefitOptions, console: Console | None = None) -> int:
 
 def table_of(found: Refit) -> TableView:
     """Return the table of what was fitted."""
-    columns = (
-        Column("quantity", number=False),
-        Column("unit", number=False),
-        Column("fitted"),
-        Column("95 % interval"),
-        Column("profile"),
-    )
+    columns = columns_of("<quantity | <unit | fitted | 95 % interval | profile")
     rows = tuple(
         (
             each.meaning,

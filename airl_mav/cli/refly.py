@@ -17,7 +17,7 @@ from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity
 from airl_mav.report.comparison.runs import compare_folders
 from airl_mav.report.comparison.show import show_comparison
-from airl_mav.report.table import NONE, Column, TableView, print_table
+from airl_mav.report.table import NONE, TableView, columns_of, print_table
 from airl_mav.scenario.model import GREATEST_SEED
 
 if TYPE_CHECKING:
@@ -133,13 +133,7 @@ def run(options: ReflyOptions, console: Console | None = None) -> int:
 
 def parts_table(parts: Sequence[PartFlown], flown_s: float) -> TableView:
     """Return what the flight and its rehearsals differ by, with each part of a refit."""
-    columns = (
-        Column("with", number=False),
-        Column("reached"),
-        Column("time", "s"),
-        Column("off", "%"),
-        Column("path apart", "m"),
-    )
+    columns = columns_of("<with | reached | time [s] | off [%] | path apart [m]")
     rows = tuple(
         (
             each.part,

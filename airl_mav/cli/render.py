@@ -18,7 +18,7 @@ from airl_mav.camera.flow import CameraMotion
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.render import Motion
 from airl_mav.cli.options import POSITIONAL, check_installed
-from airl_mav.cli.recordings import folder_of
+from airl_mav.cli.shared_options import folder_of
 from airl_mav.core.console import new_console
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError
@@ -33,29 +33,8 @@ from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.projection import Projection, check_fov
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.run_folder import load
+from airl_mav.report import camera_pictures, ground_truth
 from airl_mav.report.arenas import trust_arenas
-from airl_mav.report.camera_pictures import (
-    FILMS,
-    VIDEO,
-    Drawn,
-    Pixels,
-    Shown,
-    film,
-    moments,
-    still,
-    write_film,
-    write_png,
-)
-from airl_mav.report.ground_truth import (
-    ARRAY,
-    TRUTHS,
-    TakingCamera,
-    coloured_flow,
-    taken_film,
-    truth_film,
-    truth_of,
-    write_array,
-)
 from airl_mav.report.replay.runs import ReplayedRun
 from airl_mav.scenario.model import DEFAULT_ARENA, GREATEST_SEED
 
@@ -111,7 +90,7 @@ class RenderOptions(ProfileModel):
     seed: int | None = quantity(
         "seed of the arena; by default the profile's", "1", ge=0, le=GREATEST_SEED, default=None
     )
-    show: Shown = Field(
+    show: camera_pictures.Shown = Field(
         default="rgb",
         description="colour, its luma, depth (near is bright), segmentation (what is seen), or flow"
         " (how fast it moves over the image)",
@@ -226,13 +205,14 @@ def _check(options: RenderOptions, filmed: bool) -> None:
         if value != RenderOptions.model_fields[name].default:
             subject = "a flight" if filmed else "an arena"
             raise FieldError(name, value, problem=f"not for the picture of {subject}")
-    suffixes = (*(FILMS if filmed else (".png",)), ARRAY)
+    suffixes = (*(camera_pictures.FILMS if filmed else (".png",)), ground_truth.ARRAY)
     if options.out is not None and options.out.suffix.lower() not in suffixes:
         names = " or ".join(", ".join(suffixes).rsplit(", ", 1))
         raise FieldError("out", f"{options.out}", f"a file name that ends in {names}")
-    numbers = options.out is not None and options.out.suffix.lower() == ARRAY
-    if numbers and (options.camera is not None or options.show not in TRUTHS):
-        accepted = f"{', '.join(TRUTHS[:-1])} or {TRUTHS[-1]} in a file {ARRAY}, without --camera"
+    numbers = options.out is not None and options.out.suffix.lower() == ground_truth.ARRAY
+    if numbers and (options.camera is not None or options.show not in ground_truth.TRUTHS):
+        accepted = " or ".join(", ".join(ground_truth.TRUTHS).rsplit(", ", 1))
+        accepted += f" in a file {ground_truth.ARRAY}, without --camera"
         raise FieldError("show", options.show, accepted)
     for name in _not_asked_for(options):
         value = getattr(options, name)
@@ -241,7 +221,7 @@ def _check(options: RenderOptions, filmed: bool) -> None:
             raise FieldError(name, value, problem=problem)
     check_fov("fov_deg", options.projection, options.fov_deg)
     check_distortion("distortion", options.projection, options.fov_deg, options.distortion)
-    if options.out is not None and options.out.suffix.lower() == VIDEO:
+    if options.out is not None and options.out.suffix.lower() == camera_pictures.VIDEO:
         check_installed("film")
     if options.renderer == "mitsuba":
         check_installed("render")
@@ -256,20 +236,20 @@ def _not_asked_for(options: RenderOptions) -> tuple[str, ...]:
     return OF_A_VEHICLE[-1:] if options.show == "flow" else OF_A_VEHICLE
 
 
-def _taking(vehicle: str, name: str | None) -> TakingCamera:
+def _taking(vehicle: str, name: str | None) -> ground_truth.TakingCamera:
     """Return a camera of a vehicle profile, the main one or an additional one by name."""
     profile = load_vehicle(vehicle)
     if name is None:
-        return TakingCamera(profile.camera)
+        return ground_truth.TakingCamera(profile.camera)
     if name not in profile.cameras:
         known = ", ".join(profile.cameras) or f"none: vehicle {vehicle} has its main camera alone"
         raise FieldError("camera_name", name, known)
-    return TakingCamera(profile.cameras[name], name)
+    return ground_truth.TakingCamera(profile.cameras[name], name)
 
 
 def _is_truth(options: RenderOptions, out: Path) -> bool:
     """Return whether what is asked for are numbers of the ground truth, or drawn of them."""
-    return options.show == "flow" or out.suffix.lower() == ARRAY
+    return options.show == "flow" or out.suffix.lower() == ground_truth.ARRAY
 
 
 def _camera(options: RenderOptions, size: tuple[int, int]) -> Intrinsics:
@@ -283,7 +263,7 @@ def _camera(options: RenderOptions, size: tuple[int, int]) -> Intrinsics:
     )
 
 
-def _drawn(options: RenderOptions, samples: int) -> Drawn:
+def _drawn(options: RenderOptions, samples: int) -> camera_pictures.Drawn:
     """Return what draws, with so many rays or paths a pixel."""
     if options.renderer == "mitsuba":
         # Imported here: what it draws with is an extra.
@@ -291,7 +271,7 @@ def _drawn(options: RenderOptions, samples: int) -> Drawn:
 
         return partial(PathTracer(samples), seed=0)
     rays = math.ceil(math.sqrt(samples))
-    return partial(still, show=options.show, rays=rays, range_m=options.range_m)
+    return partial(camera_pictures.still, show=options.show, rays=rays, range_m=options.range_m)
 
 
 def _picture(options: RenderOptions, out: Path) -> str:
@@ -312,20 +292,20 @@ def _picture(options: RenderOptions, out: Path) -> str:
     if options.camera is not None:
         motion = Motion(position, attitude, velocity, rates)
         camera_of = _taking(options.camera, options.camera_name)
-        write_png(out, camera_of(arena, elapsed_us, motion, arena.seed))
+        camera_pictures.write_png(out, camera_of(arena, elapsed_us, motion, arena.seed))
         return "picture"
     centers = arena.centers_at(elapsed_us)
     camera = _camera(options, STILL_PX)
     if _is_truth(options, out):
         moves = CameraMotion(position, attitude, velocity, rates)
-        truth = truth_of(options.show, arena, elapsed_us, camera, moves)
-        if out.suffix.lower() == ARRAY:
-            write_array(out, truth)
+        truth = ground_truth.truth_of(options.show, arena, elapsed_us, camera, moves)
+        if out.suffix.lower() == ground_truth.ARRAY:
+            ground_truth.write_array(out, truth)
             return options.show
-        write_png(out, coloured_flow(truth))
+        camera_pictures.write_png(out, ground_truth.coloured_flow(truth))
         return "picture"
     drawn = _drawn(options, options.samples or SAMPLES[options.renderer])
-    write_png(out, drawn(arena, centers, camera, position, attitude))
+    camera_pictures.write_png(out, drawn(arena, centers, camera, position, attitude))
     return "picture"
 
 
@@ -338,7 +318,7 @@ def _film(options: RenderOptions, path: Path, out: Path, console: Console) -> st
     drawn = _drawn(options, options.samples or FILM_SAMPLES[options.renderer])
     camera = _camera(options, FILM_PX)
     flight = run.flight(record)
-    times = moments(flight, options.rate_hz)
+    times = camera_pictures.moments(flight, options.rate_hz)
     taking = None if options.camera is None else _taking(options.camera, options.camera_name)
     with RichProgress(console) as progress:
         bar = progress.bar("film", len(times), unit="pictures")
@@ -348,17 +328,17 @@ def _film(options: RenderOptions, path: Path, out: Path, console: Console) -> st
                 yield time_us
                 bar.advance()
 
-        pictures: Iterator[Pixels]
+        pictures: Iterator[camera_pictures.Pixels]
         if _is_truth(options, out):
-            truths = truth_film(options.show, flight, camera, told())
-            if out.suffix.lower() == ARRAY:
+            truths = ground_truth.truth_film(options.show, flight, camera, told())
+            if out.suffix.lower() == ground_truth.ARRAY:
                 stack = np.stack(list(truths))
-                write_array(out, stack)
+                ground_truth.write_array(out, stack)
                 return f"{options.show} of flight {record.index}, {len(stack)} pictures"
-            pictures = map(coloured_flow, truths)
+            pictures = map(ground_truth.coloured_flow, truths)
         elif taking is None:
-            pictures = film(flight, camera, drawn, told())
+            pictures = camera_pictures.film(flight, camera, drawn, told())
         else:
-            pictures = taken_film(flight, taking, told())
-        count = write_film(out, pictures, options.rate_hz)
+            pictures = ground_truth.taken_film(flight, taking, told())
+        count = camera_pictures.write_film(out, pictures, options.rate_hz)
     return f"film of flight {record.index}, {count} pictures"

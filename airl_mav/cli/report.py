@@ -10,7 +10,7 @@ from rich.console import Console
 
 from airl_mav.black_box.messages import SUFFIX
 from airl_mav.cli.options import POSITIONAL
-from airl_mav.cli.recordings import folder_of
+from airl_mav.cli.shared_options import TrustArenas, folder_of
 from airl_mav.core.clock import utc_now
 from airl_mav.core.console import new_console
 from airl_mav.core.errors import FieldError
@@ -53,10 +53,7 @@ class ReportOptions(ProfileModel):
         description="with one black box: the flight controller's own log of that flight (.ulg); the"
         " path, power and motor outputs are those of the log then",
     )
-    trust: bool = Field(
-        default=False,
-        description="run the arena generators that the runs name: code of whoever made the folder",
-    )
+    trust: TrustArenas = False
 
 
 OPTIONS = ReportOptions

@@ -11,15 +11,13 @@ from typing import TYPE_CHECKING
 from pydantic import Field
 from rich.console import Console
 
-from airl_mav.cli.gate import Gate, leave, requirements_of
 from airl_mav.cli.options import check_installed, run_command, scenario_of
+from airl_mav.cli.shared_options import Gate, Viewing, leave, requirements_of, view_of
 from airl_mav.cli.telling import Telling, Voice
-from airl_mav.cli.video import watcher_of
-from airl_mav.cli.viewing import Viewing, view_of
+from airl_mav.cli.video import video_shown, video_words, watcher_of
 from airl_mav.core.ports import LOOPBACK
 from airl_mav.experiments.live import EXIT_CODES, FlownRun, fly_live
 from airl_mav.profiles.camera_kind import SLOW
-from airl_mav.rehearsal.video import video_shown, video_words
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 from airl_mav.scenario.resolved import ResolvedScenario
@@ -60,10 +58,7 @@ OPTIONS = SitlOptions
 
 
 def run(options: SitlOptions, console: Console | None = None) -> int:
-    """Fly the rest of the episodes and write the report.
-
-    Returns 0, 1 if an episode was lost too often, 3 to 5 as of the verdict, 130 after Ctrl-C.
-    """
+    """Fly the rest, write the report; return 0, 1 (lost), 3 to 5 (verdict) or 130 (Ctrl-C)."""
     voice = Voice(options, "airl-sitl", console)
     requirements = requirements_of(options, reference=False)
     view = view_of(options)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from pydantic import Field
@@ -122,15 +121,10 @@ class Voice:
             self._json.tell(Started(SCHEMA, self._command, __version__, now))
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *raised: Any) -> None:
         """Remove the bars."""
         if self._drawn is not None:
-            self._drawn.__exit__(kind, error, trace)
+            self._drawn.__exit__(*raised)
 
     def finish(
         self,
@@ -143,17 +137,7 @@ class Voice:
         runs: Mapping[str, LoadedRun] | None = None,
         more: Sequence[str] = (),
     ) -> None:
-        """Write the machine-readable result.
-
-        Args:
-            exit_status: Of the command.
-            ended: "complete", "interrupted" or "broken off".
-            path: Output folder.
-            verdict: The verdict.
-            page: The report.
-            runs: Runs with flights, by name.
-            more: Additional lines of the result.
-        """
+        """Write the result of a command, which has "complete", is "interrupted" or "broken off"."""
         lines = () if verdict is None else verdict.lines
         if self._json is not None:
             told = tuple(_told(name, run) for name, run in (runs or {}).items())

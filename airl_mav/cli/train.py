@@ -14,8 +14,8 @@ from pydantic import Field
 from rich.console import Console
 
 from airl_mav.cli.options import POSITIONAL
+from airl_mav.cli.shared_options import Viewing, view_of
 from airl_mav.cli.telling import Telling, Voice
-from airl_mav.cli.viewing import Viewing, view_of
 from airl_mav.core.compiling import COMPILING, heard_compiling
 from airl_mav.core.errors import EXIT_INTERRUPTED, FieldError, UsageError
 from airl_mav.core.first_start import compile_shown
@@ -49,10 +49,7 @@ EXTRAS = ("sim", "train")
 def run(
     options: TrainOptions, console: Console | None = None, *, command_line: str | None = None
 ) -> int:
-    """Train, export, and print the result; return 0, or 130 after Ctrl-C.
-
-    `command_line` is recorded on the card. Raises UsageError as `airl_mav.training.run.train`.
-    """
+    """Train, export, and print the result; return 0, or 130 after Ctrl-C."""
     from airl_mav.envs.stopping import injections_of, speed_bound
 
     asked = view_of(options)

@@ -9,19 +9,13 @@ from pydantic import Field
 from rich.console import Console
 
 from airl_mav.cli.experiments import OnboardOptions, episodes
-from airl_mav.cli.gate import Gate, leave, requirements_of
 from airl_mav.cli.options import POSITIONAL, REPEATED, scenario_of
+from airl_mav.cli.shared_options import Gate, leave, requirements_of
 from airl_mav.cli.telling import Voice
 from airl_mav.experiments.live import EXIT_CODES
 from airl_mav.experiments.verdict import seek_verdict
 from airl_mav.flight.sequential import LOOKS
-from airl_mav.scenario.model import (
-    DEFAULT_ARENA,
-    DEFAULT_POLICY,
-    ArenaName,
-    Flights,
-    LevelName,
-)
+from airl_mav.scenario import model
 
 DEFAULT_REQUIREMENT = "success >= 95 %"
 
@@ -39,17 +33,17 @@ class VerdictOptions(OnboardOptions):
     """
 
     policy: Annotated[str, POSITIONAL] = Field(
-        default=DEFAULT_POLICY,
+        default=model.DEFAULT_POLICY,
         description="a name, or a path to a folder with policy.onnx and card.json",
     )
-    arena: ArenaName = DEFAULT_ARENA
+    arena: model.ArenaName = model.DEFAULT_ARENA
     require: Annotated[tuple[str, ...], REPEATED] = Field(
         default=(),
         description=f"{Gate.model_fields['require'].description}; by default"
         f" '{DEFAULT_REQUIREMENT}'",
     )
-    level: LevelName = Field(
-        default="lockstep", description=Flights.model_fields["level"].description
+    level: model.LevelName = Field(
+        default="lockstep", description=model.Flights.model_fields["level"].description
     )
     episodes: int = episodes(
         "greatest number of flights on the onboard computer; it is looked whether they decide after"

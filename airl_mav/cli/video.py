@@ -4,20 +4,27 @@ from __future__ import annotations
 
 import signal
 import socket
+import sys
+import tempfile
 import threading
-from contextlib import ExitStack, closing
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, contextmanager
+from pathlib import Path
 
 from pydantic import Field
 from rich.console import Console
 
 from airl_mav.cli.options import run_command
+from airl_mav.core.child_process import ChildProcess
 from airl_mav.core.clock import WallClock
 from airl_mav.core.console import new_console
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel
+from airl_mav.core.ports import LOOPBACK
 from airl_mav.core.scheduling import give_way
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.aircraft import DEFAULT_VEHICLE, GREATEST_PORT, VehicleName
+from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.stand_alone import CameraName
 from companion.video import GIMBAL_PORT, Watcher
 
@@ -99,3 +106,44 @@ def watcher_of(address: str, field: str = "to") -> Watcher:
 
 if __name__ == "__main__":
     run_command("airl video", "airl_mav.cli.video")
+
+
+MODULE = "airl_mav.cli.video"
+
+
+def video_words(asked: Scenario, to: str) -> list[str]:
+    """Return the options of `airl video` for a camera and a watcher; FieldError: no address."""
+    if asked.level != "sitl":
+        raise FieldError(
+            "video", to, problem="accepted: with level sitl, whose camera has a socket"
+        )
+    ports = asked.open_ports
+    if ports.camera_port == 0:
+        raise FieldError("video", to, problem="accepted: with a camera port of your choice, not 0")
+    camera = f"tcp://{LOOPBACK}:{ports.camera_port}"
+    words = ["--camera", camera, "--vehicle", asked.vehicle, "--to", to]
+    return [*words, "--connect", _network(asked) or "None"]
+
+
+def _network(asked: Scenario) -> str | None:
+    """Return where the camera joins the vehicle's network; None: unsigned, or other firmware."""
+    if asked.firmware == "px4":
+        return f"udpin://{LOOPBACK}:{GIMBAL_PORT + asked.real.instance}"
+    if asked.firmware == "builtin" and asked.signing_key is None:
+        return f"udpout://{LOOPBACK}:{asked.open_ports.gcs_local_port}"
+    return None
+
+
+@contextmanager
+def video_shown(words: list[str], say: Callable[[str], None]) -> Iterator[None]:
+    """Show the video while the context lasts; the flights go on if it fails, which is said then."""
+    with tempfile.TemporaryDirectory(prefix="airl-video-") as folder:
+        # Behind a guard: it must not outlive whoever started it.
+        command = [sys.executable, "-m", MODULE, *words]
+        child = ChildProcess(command, Path(folder) / "video.log", guarded=True)
+        try:
+            yield
+        finally:
+            if child.poll() is not None:
+                say(f"the video ended early\n{child.log_tail()}")
+            child.stop()

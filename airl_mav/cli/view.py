@@ -11,7 +11,7 @@ from pydantic import Field
 from rich.console import Console
 
 from airl_mav.cli.options import POSITIONAL
-from airl_mav.cli.recordings import folder_of
+from airl_mav.cli.shared_options import TrustArenas, folder_of
 from airl_mav.core.console import new_console
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity
@@ -52,10 +52,7 @@ class ViewOptions(ProfileModel):
         le=GREATEST_PORT,
         default=None,
     )
-    trust: bool = Field(
-        default=False,
-        description="run the arena generators that the runs name: code of whoever made the folder",
-    )
+    trust: TrustArenas = False
 
 
 OPTIONS = ViewOptions

@@ -62,9 +62,6 @@ def check_conformance(
         connect_timeout_s: Timeout for finding a flight controller, 1 to 3600 [wall s].
         progress: Called with each line of the transcript, by any thread.
 
-    Returns:
-        All checks, step responses and the transcript.
-
     Raises:
         UsageError: Invalid value or connection, port taken, no heartbeat, or unknown autopilot;
             nothing was commanded.

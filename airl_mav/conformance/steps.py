@@ -131,18 +131,7 @@ def step_response(
     after: float,
     change: float,
 ) -> StepResponse:
-    """Return the characteristics of a step.
-
-    Args:
-        times_s: (n,) times of the values since sending; < 0 is before it [s].
-        values: (n,) values [unit].
-        before: Old setpoint [unit].
-        after: New setpoint, different from the old [unit].
-        change: Movement that ends the latency, from the mean before the step, > 0 [unit].
-
-    Raises:
-        ValueError: There are no values before or after the step.
-    """
+    """Return the characteristics of a step; `change` is the movement that ends the latency."""
     quiet, answer = times_s < 0.0, times_s >= 0.0
     if not quiet.any() or not answer.any():
         raise ValueError("a step response needs samples from before and after the step")
@@ -179,10 +168,7 @@ class MeasuredStep(NamedTuple):
 
     @property
     def median(self) -> StepResponse:
-        """Median of each figure over the repetitions; NaN where one did not get there.
-
-        A mean would be dominated by estimator noise that looks like an early movement.
-        """
+        """Median of each figure over the repetitions; NaN where one is. Noise moves it little."""
         return StepResponse(*np.median(np.array(self.flights), axis=0).tolist())
 
 
@@ -240,11 +226,7 @@ def plan(names: tuple[StepName, ...], *, mirrored: bool) -> list[Leg]:
 
 
 def measure(step: Step, motion: Motion, sent_s: float) -> StepResponse:
-    """Return a step's response from `BEFORE_S` before it to its end; `sent_s` is its arrival [s].
-
-    Raises:
-        ValueError: Telemetry is missing before or after the step.
-    """
+    """Return a step's response from `BEFORE_S` before its arrival at `sent_s` [s] to its end."""
     position, heading = motion
     velocity, times_s = motion.velocity, position[:, 0]
     if step.quantity == "heading":

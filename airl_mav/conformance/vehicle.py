@@ -1,6 +1,6 @@
 """The vehicle under test: MAVSDK's calls, and raw messages through MAVSDK.
 
-Timeouts follow the vehicle's clock, at any simulation speed; silence is measured by the wall clock.
+Timeouts follow the vehicle's clock, at any simulation speed. Silence is measured by the wall clock.
 """
 
 from __future__ import annotations
@@ -53,10 +53,7 @@ class Vehicle:
     """One vehicle, observed and commanded."""
 
     def __init__(self, url: str, speed: float, transcript: Transcript) -> None:
-        """Open a MAVSDK connection. Raises UsageError if its URL is invalid or its port taken.
-
-        `speed` is the simulated seconds per wall second of the vehicle.
-        """
+        """Open a MAVSDK connection to a vehicle of some speed, or raise UsageError."""
         self.url, self.speed = url, speed
         self.transcript = transcript
         self.telemetry = telemetry.Telemetry(transcript)

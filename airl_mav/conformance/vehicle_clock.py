@@ -1,6 +1,6 @@
 """The vehicle's time at the moment when something is sent to it.
 
-The vehicle is asked for its time right before: between that exchange of a few milliseconds and the
+The vehicle is asked for its time right before. Between that exchange of a few milliseconds and the
 setpoint that follows, neither the clocks' drift nor the pace of a simulation matters (F. Cristian,
 "Probabilistic clock synchronization", Distributed Computing 3, 1989).
 """
@@ -106,10 +106,7 @@ class VehicleClock:
         return self._telemetry.boot_s if found is None else found.boot_s
 
     def sending_time(self) -> float:
-        """Return the arrival time of a message sent right after this call [s].
-
-        Read before sending: a MAVSDK call sends at once but returns later.
-        """
+        """Return the arrival time of a message that is sent right after this call [s]."""
         newest_s, found = self._telemetry.boot_s, self.exchange()
         if found is None:
             self.inexact += 1

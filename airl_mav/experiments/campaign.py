@@ -1,7 +1,4 @@
-"""Campaigns: the evaluations of an experiment, flown by one executor, each into its run folder.
-
-Jobs of all cells follow each other without a wait; a folder is locked from its first job on.
-"""
+"""Campaigns: the evaluations of an experiment, flown by one executor, each into its run folder."""
 
 from __future__ import annotations
 
@@ -14,8 +11,7 @@ from pathlib import Path
 from airl_mav.core.compiling import COMPILING
 from airl_mav.core.first_start import compile_first
 from airl_mav.core.progress import Progress
-from airl_mav.experiments.executors import Executor, Stop, WorkerError, never
-from airl_mav.experiments.flier import Flier, FlyEpisodes
+from airl_mav.experiments.executors import Executor, Flier, FlyEpisodes, Stop, WorkerError, never
 from airl_mav.experiments.live import Ended
 from airl_mav.experiments.store import CampaignStore
 from airl_mav.flight.record import EpisodeRecord
@@ -134,18 +130,7 @@ def run_cell(
     progress: Progress | None = None,
     stop: Stop = never,
 ) -> CampaignRun:
-    """Fly the rest of one evaluation; see `run_cells`.
-
-    Args:
-        out: Its run folder; None = `runs/<UTC time>-<name of the cell>`.
-        cell: The evaluation.
-        executor: Executor of the flights.
-        progress: Progress display.
-        stop: Polled several times a second; True stops and keeps finished flights.
-
-    Raises:
-        UsageError: The folder holds another run, or no arena can be made of a seed.
-    """
+    """Fly the rest of one evaluation; see `run_cells`. Without `out` its folder is a new one."""
     return _run({cell.name: out}, [cell], executor, progress or Progress(), stop)
 
 
@@ -158,7 +143,7 @@ def run_cells(
     stop: Stop = never,
     ended: Callable[[CellRun], None] = lambda _: None,
 ) -> CampaignRun:
-    """Fly the rest of a campaign; arguments as of `run_cell`.
+    """Fly the rest of a campaign until `stop`, which is polled several times a second.
 
     `cells` have different names; those with the same flights share a run folder. `ended` is called
     for each complete cell, also if it was complete before.

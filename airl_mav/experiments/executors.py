@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Protocol, TypeVar
 
@@ -10,7 +10,9 @@ from airl_mav.core.compiling import Heard, heard_compiling
 from airl_mav.core.constants import MAX_ATTEMPTS
 from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import quantity
+from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
 from airl_mav.scenario.model import Workers
+from airl_mav.scenario.resolved import PlannedEpisode
 
 J = TypeVar("J")
 R = TypeVar("R")
@@ -23,7 +25,7 @@ Work = Callable[[J], Iterable[R]]
 
 Start = Callable[[Stop], Work[J, R]]
 """Called once in each worker, to load everything. Goes there by pickle. It is given what asks
-whether the work is to be stopped, for work in this process; other workers are ended instead."""
+whether the work is to be stopped, for work in this process. Other workers are ended instead."""
 
 Results = Generator[tuple[J, R], None, None]
 """Results as they come, each with its job. Closing it ends the workers, whatever they do."""
@@ -69,15 +71,11 @@ class Executor(Protocol):
         lost: Callable[[str], None] = lambda _: None,
         compiling: Heard = lambda _: None,
     ) -> Results[J, R]:
-        """Run jobs on free workers and yield their results in any order.
+        """Run jobs, taken lazily, on free workers and yield their results in any order.
 
-        Args:
-            jobs: The jobs, taken lazily.
-            start: Initializes a worker.
-            name: Returns a job's name for messages.
-            stop: Polled several times a second; True aborts the running jobs.
-            lost: Called with one line per lost worker; its job restarts, without partial results.
-            compiling: Called when local workers begin and end compiling kernels.
+        `start` initializes a worker; `stop` is polled several times a second and aborts the running
+        jobs; `lost` is told in one line of each lost worker, whose job restarts without partial
+        results; `compiling` is called when local workers begin and end compiling kernels.
 
         Raises:
             UsageError: A job rejects its input.
@@ -154,3 +152,18 @@ def next_attempt(job: str, attempt: int, cause: str, lost: Callable[[str], None]
         raise WorkerError(f"{job}: lost {MAX_ATTEMPTS} workers, the last one by {cause}")
     lost(f"a worker was lost by {cause}: {job} begins again")
     return attempt + 1
+
+
+FlyEpisodes = Callable[[Sequence[PlannedEpisode]], Iterable[FlownEpisode]]
+
+
+class Flier(Protocol):
+    """How the episodes of a scenario are flown. Goes to workers by pickle."""
+
+    def episodes_per_job(self, episodes: int, workers: int) -> int:
+        """Return the episodes per job for executors that do not stream results."""
+        ...
+
+    def start(self, folder: RunFolder, stop: Stop) -> FlyEpisodes:
+        """Load everything once; return a function that flies episodes and polls `stop`."""
+        ...

@@ -154,16 +154,7 @@ def run_and_compare(
 
 
 def run_experiment(experiment: Experiment, out: Path | None, progress: Progress) -> ExperimentRun:
-    """Fly the rest of an experiment; Ctrl-C and SIGTERM stop it and keep finished flights.
-
-    Args:
-        experiment: The experiment.
-        out: Folder to create or resume; None = a new one.
-        progress: Progress display.
-
-    Raises:
-        UsageError: The folder holds something else, or a cell cannot be flown.
-    """
+    """Fly the rest of an experiment; Ctrl-C and SIGTERM stop it and keep finished flights."""
     root = experiment.root(out)
     for remark in (*experiment.remarks, *known_seeds(experiment.cells)):
         progress.note(remark, "yellow")

@@ -36,11 +36,7 @@ def fly_scenario(
     *,
     executor: Executor | None = None,
 ) -> FlownRun:
-    """Fly the rest of a scenario at any level, several flights at a time if possible.
-
-    Ctrl-C and SIGTERM stop it and keep finished flights; otherwise as `live.fly_live`. `executor`
-    is one that scenarios share; None = a new one.
-    """
+    """Fly the rest of a scenario at any level, several flights at a time if possible."""
     asked = scenario.scenario
     name = run_name(scenario)
     if asked.level == "sitl":

@@ -28,7 +28,7 @@ NOT_MITIGATED = "none"
 """In place of the mitigated policy: fly the gap alone."""
 
 TRAINING_LATENCY_SEED = 1
-"""The latencies of the training's conditions are drawn anew: with the same draws as the target's,
+"""The latencies of the training's conditions are drawn anew. With the same draws as the target's,
 the mitigated policy would be compared with itself."""
 
 

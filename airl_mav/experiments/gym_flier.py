@@ -23,8 +23,7 @@ from airl_mav.envs.fleet import Flights
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec, spec_of
 from airl_mav.envs.trace import Trace
-from airl_mav.experiments.executors import Stop
-from airl_mav.experiments.flier import FlyEpisodes
+from airl_mav.experiments.executors import FlyEpisodes, Stop
 from airl_mav.faults.twin import check_twin
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.quality import measure_quality
@@ -108,10 +107,7 @@ def navigation_of(
     trace: Trace | None = None,
     compensator: Compensator | None = None,
 ) -> Navigation:
-    """Return the vectorized simulator of a scenario, `slots` flights at a time, or UsageError.
-
-    `trace` records; `compensator` is one of `slots` companions; None = the vehicle's.
-    """
+    """Return the vectorized simulator of a scenario, `slots` flights at a time, or UsageError."""
     asked = scenario.scenario
     return Navigation(
         environment_of(scenario),

@@ -1,8 +1,8 @@
 """Worker processes of this machine: each takes one job after the other, a lost one is replaced.
 
-Nothing is shared but one pipe a worker, so that a worker that is killed, even half-way through an
-answer, cannot hold up the others. Workers are new processes ("spawn"), never forks: threads of
-MAVSDK and of ONNX Runtime do not survive one. A worker ends with its parent, however that ends.
+Each worker has a pipe of its own, so a killed one cannot hold up the others. Workers are spawned,
+never forks: threads of MAVSDK and of ONNX Runtime do not survive one. A worker ends with its
+parent.
 """
 
 from __future__ import annotations
@@ -317,15 +317,7 @@ def side_by_side(settings: Workers) -> int:
 
 @contextmanager
 def open_executor(settings: Workers, *, in_process: bool = False) -> Iterator[executors.Executor]:
-    """Open the executor of the settings.
-
-    Args:
-        settings: Workers; by default no job takes a GPU.
-        in_process: One worker may be this process, and is by default.
-
-    Raises:
-        UsageError: Ray is missing or unreachable, or too many workers for the firmware.
-    """
+    """Open the executor of the settings; one worker may be this process if `in_process`."""
     cores = min(usable_cores(), GREATEST_WORKERS)
     if settings.executor == "ray":
         # Imported here: Ray is an extra.

@@ -65,11 +65,7 @@ class _Witness:
 
 
 def frames_of(folder: Path, *, flights: int = FLIGHTS) -> tuple[Encoded, str, int]:
-    """Fly a policy in its training arena on seeds that no evaluation uses.
-
-    Returns:
-        The network's inputs, (n, ...) each; the arena; the last seed.
-    """
+    """Return a policy's inputs of flights on its own seeds, its training arena, the last seed."""
     card = load_card(folder)
     arena = card.training.arena or DEFAULT_ARENA
     environment = training_environment(card) or {}
@@ -101,15 +97,8 @@ def export_int8(
 ) -> PolicyCard:
     """Write a policy in 8-bit integers with its card, without the float policy's results.
 
-    Args:
-        source: Folder of the float policy.
-        out: Folder for policy.onnx and card.json.
-        name: Short name; None = the source's with `-int8`.
-        flights: Flights that provide the calibration frames.
-
-    Raises:
-        UsageError: Not a float policy, cannot be flown or quantised, or `out` is the source or not
-            writable.
+    Without a name it is called as the source, with `-int8`. Raises UsageError if the source is no
+    float policy, or cannot be flown or quantised, or `out` is the source or not writable.
     """
     card = load_card(source)
     if card.quantisation is not None:

@@ -130,11 +130,7 @@ def _check_reachable(address: str) -> None:
 
 @contextmanager
 def connected(settings: Workers, cores: int, gpus: float) -> Iterator[RayExecutor]:
-    """Connect to the Ray of the settings; `gpus` is the share of a GPU per job.
-
-    Raises:
-        UsageError: Ray is not installed, or there is none at that address.
-    """
+    """Connect to Ray, or raise UsageError; `gpus` is the share of a GPU per job."""
     if find_spec("ray") is None:
         raise FieldError("executor", "ray", problem="not installed: pip install 'airl-mav[ray]'")
     address, local = settings.ray_address, settings.ray_address == LOCAL

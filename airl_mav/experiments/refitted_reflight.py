@@ -77,11 +77,8 @@ def refly_parts(
 ) -> tuple[Reflight, tuple[PartFlown, ...]]:
     """Rehearse a recorded flight with a whole refit, each part of it, and none, on equal seeds.
 
-    The change made by one part alone is what it explains; the parts need not add up. `folder` holds
-    the refit, `out` gets `parts` beside the folders of `refly`, which has the other arguments.
-
-    Returns:
-        The rehearsals with the whole refit, and the figures of each part.
+    The change made by one part alone is what it explains. The parts need not add up. `out` gets
+    `parts` beside the folders of `refly`, which has the other arguments.
     """
     everything, base = changes_of(folder), _read(folder).vehicle
     nothing = Changes(vehicle=base, prompt=True)

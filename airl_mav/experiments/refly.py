@@ -38,7 +38,7 @@ ARENA_FILE = "arena.toml"
 LATENCIES_FILE = "latencies.txt"
 
 CLEAR_M = 30.0
-"""Walls of an arena that is made for a flight are this far from its start and its goal [m]: farther
+"""Walls of an arena that is made for a flight are this far from its start and its goal [m]. Farther
 than any shipped camera sees."""
 
 SAME_GOAL_M = 1.0
@@ -115,27 +115,17 @@ def refly(
     changes: Changes = AS_FLOWN,
     progress: bool = False,
 ) -> Reflight:
-    """Rehearse a recorded flight several times.
+    """Rehearse a recorded flight several times, with different sensor noise.
 
-    Discrete decisions amplify centimetres into another way around a tree, so that flights differ by
-    sensor noise; the recorded flight is compared with all rehearsals. Without an arena they fly
+    Discrete decisions amplify centimetres into another way around a tree. So flights differ by
+    sensor noise. The recorded flight is compared with all rehearsals. Without an arena they fly
     over an empty plain, and both paths start at the origin, heading north. An arena, which the
-    flight was in, keeps its frame.
+    flight was in, keeps its frame. Its seed is the flight's unless another is given. The policy is
+    the recorded one, by its name, unless another is given. `out` becomes the folder of the run
+    folders `flown` and `rehearsed`.
 
-    Args:
-        path: The black box.
-        out: New folder for the run folders `flown` and `rehearsed`.
-        arena: Arena profile: a shipped name, or a path.
-        arena_seed: Its seed; None = the flight's.
-        episodes: Number of rehearsals, with different sensor noise.
-        policy: Policy to rehearse; None = the recorded one, by its name.
-        trust: See `Scenario.trust`.
-        changes: Changes to the flight's settings.
-        progress: Draw a progress bar on standard error.
-
-    Raises:
-        UsageError: No navigation or unusable settings in the recording, or `out` holds something.
-            `FieldError`s name the field.
+    Raises UsageError for a recording without navigation or with unusable settings, and if `out`
+    holds something.
     """
     box = read_black_box(path)
     episode, info = episode_of(box), info_of(box)

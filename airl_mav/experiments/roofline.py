@@ -29,13 +29,8 @@ from airl_mav.profiles.loaded import loaded
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from airl_mav.report.document import Document, write_document
 from airl_mav.report.roofline import roofline_document
+from airl_mav.scenario import model
 from airl_mav.scenario.aircraft import DEFAULT_VEHICLE, VehicleName
-from airl_mav.scenario.model import (
-    DEFAULT_POLICY,
-    ONBOARD_COMPUTER,
-    REFERENCE_COMPUTER,
-    PilotSettings,
-)
 
 SCHEMA = 1
 
@@ -49,7 +44,7 @@ class RooflineRequest(ProfileModel):
     """A vehicle, what it sees and who decides, and the computers that it might carry."""
 
     computers: tuple[str, ...] = Field(
-        default=(ONBOARD_COMPUTER, REFERENCE_COMPUTER),
+        default=(model.ONBOARD_COMPUTER, model.REFERENCE_COMPUTER),
         description="computer profiles: shipped names, or paths to .toml",
     )
     workload: str = Field(
@@ -58,7 +53,7 @@ class RooflineRequest(ProfileModel):
         " measured there for this very policy (airl profile)",
     )
     policy: str = Field(
-        default=DEFAULT_POLICY,
+        default=model.DEFAULT_POLICY,
         description="policy whose hold is flown, and whose sensing distance is measured: a name, or"
         " a path to a folder with policy.onnx and card.json",
     )
@@ -148,7 +143,7 @@ def find_roofline(request: RooflineRequest) -> Roofline:
     distance_m = request.sensing_distance_m or min(noticed)
     hold_s = request.hold_s
     if hold_s is None:
-        hold_s = PilotSettings().hold_s if policy.card is None else policy.card.hold_s
+        hold_s = model.PilotSettings().hold_s if policy.card is None else policy.card.hold_s
     loop = DecisionLoop.of(bare, hold_s)
     points: list[RooflinePoint] = []
     left_out: list[LeftOut] = []

@@ -99,16 +99,9 @@ def open_campaign(
 ) -> Iterator[CampaignStore]:
     """Open and lock a campaign's folder, new or to resume; cells may be added or left for later.
 
-    Args:
-        path: The folder.
-        declaration: The campaign.
-        command: The command line, for a new campaign.
-        free: Settings that may differ on resumption, or names of tables of them.
-        growing: Numeric cell settings that may grow on resumption.
-        say: Called when another process has the folder.
-
-    Raises:
-        UsageError: Other content or settings, or another process works in it.
+    Settings in `free`, or in tables named there, may differ on resumption. Numeric cell settings in
+    `growing` may grow. `say` is called when another process has the folder. Raises UsageError if
+    the content or a setting is another one.
     """
     path = path.absolute()
     with locked(path, say):

@@ -1,8 +1,4 @@
-"""`airl verdict`: a group-sequential test of a policy's success rate on an onboard computer.
-
-The success rate is tested after each batch of flights (`flight.sequential`), other requirements
-once at the end.
-"""
+"""`airl verdict`: a group-sequential test of a policy's success rate (`flight.sequential`)."""
 
 from __future__ import annotations
 
@@ -56,19 +52,7 @@ def seek_verdict(
     out: Path | None = None,
     progress: Progress,
 ) -> SoughtVerdict:
-    """Fly a policy on its onboard computer until its success rate is decided, then the reference.
-
-    Args:
-        scenario: Policy and flight settings; `episodes` is the maximum number of flights.
-        requirements: Requirements, with at least one minimum success rate.
-        reference: Reference computer profile, flown on the same seeds.
-        reference_workload: As of `declare_gap`.
-        out: Folder to create or resume; None = `runs/<UTC time>-verdict-...`.
-        progress: Progress display.
-
-    Raises:
-        UsageError: It cannot be flown, or the folder holds another verdict's flights.
-    """
+    """Fly a policy on its onboard computer until it is decided, then the reference."""
     tests = [each.test() for each in requirements if each.least_rate]
     if not tests:
         raise FieldError("require", accepted="at least one least success rate: 'success >= 95 %'")

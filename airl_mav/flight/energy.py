@@ -39,18 +39,11 @@ class EnergySplit:
 def split_energy(
     path: Trajectory, start_us: int, end_us: int, vehicle: VehicleProfile, computer_watts: float
 ) -> EnergySplit:
-    """Split the energy between two simulated times by the vehicle's power model.
+    """Split the energy between two simulated times [µs] by the vehicle's power model.
 
     The recording holds the whole power, integrated at every tick, and the speed at 50 Hz. So the
-    hover is exact, what the horizontal speed adds is integrated over the samples (trapezoid), and
-    the manoeuvres are what is left: a 50 Hz recording cannot give them by itself.
-
-    Args:
-        path: The flight.
-        start_us: Start [µs].
-        end_us: End [µs].
-        vehicle: The vehicle as loaded.
-        computer_watts: Power of the onboard computer [W].
+    hover is exact. What the horizontal speed adds is integrated over the samples (trapezoid). The
+    manoeuvres are what is left. A 50 Hz recording cannot give them by itself.
     """
     part = path.between(start_us, end_us)
     time_s = max(0.0, (end_us - start_us) / US_PER_S)

@@ -80,8 +80,8 @@ class Referee:
     """Judges one episode from its true samples. Pure: no clock, no randomness.
 
     The tests, in this order (that of the paper's code, with its missing battery test): goal,
-    collision, battery, time limit. The goal and the time limit count from the start of navigation;
-    a collision or an empty battery ends the take-off too. The first verdict stands.
+    collision, battery, time limit. The goal and the time limit count from the start of navigation.
+    A collision or an empty battery ends the take-off too. The first verdict stands.
     """
 
     def __init__(self, task: Task) -> None:

@@ -1,6 +1,6 @@
 """Paired comparison of two runs on the same seeds, with 95 % intervals and numbers of pairs.
 
-Pairing by seed removes the spread that the arenas add: two runs that differ little show it after
+Pairing by seed removes the spread that the arenas add. Two runs that differ little show it after
 far fewer flights than two runs of different seeds.
 """
 
@@ -13,17 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from airl_mav.flight import statistics
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.quality import Quality
 from airl_mav.flight.record import EpisodeRecord
-from airl_mav.flight.statistics import (
-    MEANS,
-    NO_ESTIMATE,
-    QUANTILE,
-    Estimate,
-    bootstrap_interval,
-    median_of,
-)
 
 Floats = NDArray[np.float64]
 
@@ -58,9 +51,9 @@ class Change:
 
     reference: float | None
     other: float | None
-    difference: Estimate
+    difference: statistics.Estimate
     """Other minus reference; its n is the number of pairs behind all three figures."""
-    median: Estimate | None = None
+    median: statistics.Estimate | None = None
     """Median over the pairs of the difference of each one [%]. One long flight moves a mean, but
     not a median. None for the success rate."""
 
@@ -70,7 +63,7 @@ class PairedComparison:
     """A run against a reference, over pairs of flights with the same seed.
 
     The difference of a mean is `100 (other - reference) / reference` percent, over the common
-    successes; that of the success rate is in percentage points, over all pairs.
+    successes. That of the success rate is in percentage points, over all pairs.
     """
 
     agreement: Agreement
@@ -90,10 +83,8 @@ def pair_by_seed(
 ) -> tuple[Pair, ...]:
     """Return the flights of the seeds that both runs hold, in the order of the reference.
 
-    An invalid flight was no test of the policy: its seed makes no pair.
-
-    Raises:
-        ValueError: A run holds a seed twice.
+    An invalid flight was no test of the policy: its seed makes no pair. Raises ValueError if a run
+    holds a seed twice.
     """
     first, second = _by_seed(reference), _by_seed(other)
     return tuple((first[seed], second[seed]) for seed in first if seed in second)
@@ -129,29 +120,19 @@ def common_successes(pairs: Sequence[Pair]) -> tuple[tuple[Quality, Quality], ..
     )
 
 
-def tango(gained: int, lost: int, n: int) -> Estimate:
+def tango(gained: int, lost: int, n: int) -> statistics.Estimate:
     """Return the difference of two paired proportions with Tango's 95 % score interval.
 
-    The differences that McNemar's test, generalised to them, does not reject (T. Tango,
-    Equivalence test and confidence interval for the difference in proportions for the paired-sample
-    design, Statistics in Medicine 17, 1998, 891-908). It keeps its coverage where few pairs differ,
-    and has a width where none does.
-
-    Args:
-        gained: Pairs of which only the other succeeded.
-        lost: Pairs of which only the reference succeeded.
-        n: All pairs.
-
-    Returns:
-        The difference other minus reference, as a fraction, -1 to 1.
-
-    Raises:
-        ValueError: More pairs differ than there are.
+    The differences that McNemar's test, generalised to them, does not reject (T. Tango, Equivalence
+    test and confidence interval for the difference in proportions for the paired-sample design,
+    Statistics in Medicine 17, 1998, 891-908). It keeps its coverage where few pairs differ, and has
+    a width where none does. Of n pairs, in those `gained` only the other succeeded, in those `lost`
+    only the reference. The difference is other minus reference, as a fraction, -1 to 1.
     """
     if min(gained, lost) < 0 or gained + lost > n:
         raise ValueError(f"gained={gained}, lost={lost}, n={n}: must be >= 0 and fit")
     if n == 0:
-        return NO_ESTIMATE
+        return statistics.NO_ESTIMATE
     value = (gained - lost) / n
 
     def end(limit: float) -> float:
@@ -161,13 +142,13 @@ def tango(gained: int, lost: int, n: int) -> Estimate:
         inside, outside = value, limit
         while abs(outside - inside) > TANGO_PRECISION:
             middle = 0.5 * (inside + outside)
-            if abs(_score(middle, gained, lost, n)) < QUANTILE:
+            if abs(_score(middle, gained, lost, n)) < statistics.QUANTILE:
                 inside = middle
             else:
                 outside = middle
         return 0.5 * (inside + outside)
 
-    return Estimate(value, end(-1.0), end(1.0), n)
+    return statistics.Estimate(value, end(-1.0), end(1.0), n)
 
 
 def _score(d: float, gained: int, lost: int, n: int) -> float:
@@ -182,21 +163,11 @@ def _score(d: float, gained: int, lost: int, n: int) -> float:
     return away / math.sqrt(variance) if variance > 0.0 else math.copysign(math.inf, away)
 
 
-def relative_difference(reference: ArrayLike, other: ArrayLike) -> Estimate:
-    """Return by how much the mean of paired values differs, with a bootstrap 95 % interval.
+def relative_difference(reference: ArrayLike, other: ArrayLike) -> statistics.Estimate:
+    """Return by how many percent the mean of paired values differs, with a bootstrap 95 % interval.
 
-    Whole pairs are drawn (BCa, seeded). One pair has no interval; pairs of one ratio have one of
-    width zero.
-
-    Args:
-        reference: Values (n,), > 0.
-        other: Values (n,) of the same seeds.
-
-    Returns:
-        100 (mean of other - mean of reference) / mean of reference [%].
-
-    Raises:
-        ValueError: The values are not paired, or one of the reference is not > 0.
+    Whole pairs (n,) are drawn (BCa, seeded). One pair has no interval. Pairs of one ratio have one
+    of width zero. Raises ValueError unless all values of the reference are > 0.
     """
     first, second = np.asarray(reference, np.float64), np.asarray(other, np.float64)
     if first.ndim != 1 or first.shape != second.shape:
@@ -205,13 +176,13 @@ def relative_difference(reference: ArrayLike, other: ArrayLike) -> Estimate:
         raise ValueError("reference: must be > 0")
     n = first.size
     if n == 0:
-        return NO_ESTIMATE
+        return statistics.NO_ESTIMATE
     value = percent_change(float(first.mean()), float(second.mean()))
     if n == 1:
-        return Estimate(value, None, None, 1)
+        return statistics.Estimate(value, None, None, 1)
     if np.ptp(second / first) <= SAME_RATIO:
-        return Estimate(value, value, value, n)
-    return Estimate(value, *bootstrap_interval((first, second), _percent), n)
+        return statistics.Estimate(value, value, value, n)
+    return statistics.Estimate(value, *statistics.bootstrap_interval((first, second), _percent), n)
 
 
 def _percent(reference: Floats, other: Floats) -> Floats:
@@ -221,18 +192,14 @@ def _percent(reference: Floats, other: Floats) -> Floats:
 def compare_pairs(
     reference: Sequence[EpisodeRecord], other: Sequence[EpisodeRecord]
 ) -> PairedComparison:
-    """Compare a run with a reference on the seeds that both hold.
-
-    Raises:
-        ValueError: A run holds a seed twice.
-    """
+    """Compare a run with a reference on their common seeds; see `pair_by_seed`."""
     pairs = pair_by_seed(reference, other)
     agreement = count_agreement(pairs)
     good = common_successes(pairs)
     return PairedComparison(
         agreement=agreement,
         success_rate=_compare_rates(agreement),
-        **{name: compare_means(*_known_by_both(good, name)) for name in MEANS},
+        **{name: compare_means(*_known_by_both(good, name)) for name in statistics.MEANS},
     )
 
 
@@ -249,7 +216,7 @@ def _compare_rates(agreement: Agreement) -> Change:
     """Return both success rates and their difference in percentage points."""
     n = agreement.n
     if n == 0:
-        return Change(None, None, NO_ESTIMATE)
+        return Change(None, None, statistics.NO_ESTIMATE)
     d = tango(agreement.only_other, agreement.only_reference, n)
     return Change(
         (agreement.both + agreement.only_reference) / n,
@@ -265,30 +232,21 @@ def compare_means(reference: ArrayLike, other: ArrayLike) -> Change:
     """
     first, second = np.asarray(reference, np.float64), np.asarray(other, np.float64)
     if not first.size:
-        return Change(None, None, NO_ESTIMATE, NO_ESTIMATE)
+        return Change(None, None, statistics.NO_ESTIMATE, statistics.NO_ESTIMATE)
     means = float(first.mean()), float(second.mean())
     if not (first > 0.0).all():
-        return Change(*means, NO_ESTIMATE, NO_ESTIMATE)
+        return Change(*means, statistics.NO_ESTIMATE, statistics.NO_ESTIMATE)
     return Change(*means, relative_difference(first, second), median_ratio(first, second))
 
 
-def median_ratio(reference: ArrayLike, other: ArrayLike) -> Estimate:
-    """Return the median over pairs of `100 (other / reference - 1)` [%]; see `median_of`.
-
-    Args:
-        reference: Values (n,), > 0.
-        other: Values (n,) of the same seeds.
-    """
+def median_ratio(reference: ArrayLike, other: ArrayLike) -> statistics.Estimate:
+    """Return the median over pairs (n,) of `100 (other / reference - 1)` [%]; see `median_of`."""
     first, second = np.asarray(reference, np.float64), np.asarray(other, np.float64)
-    return median_of(100.0 * (second / first - 1.0))
+    return statistics.median_of(100.0 * (second / first - 1.0))
 
 
 def percent_change(reference: float, other: float) -> float:
-    """Return `100 (other - reference) / reference` [%]: above 0 where the other has more.
-
-    Raises:
-        ValueError: The reference is not > 0.
-    """
+    """Return `100 (other - reference) / reference` [%]; ValueError unless `reference` > 0."""
     if not reference > 0.0:
         raise ValueError(f"reference = {reference}: must be > 0")
     return 100.0 * (other - reference) / reference

@@ -11,15 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.core.constants import US_PER_S
-from airl_mav.flight.smoothness import (
-    command_steps,
-    commanded_velocity,
-    flown_velocity,
-    jerk_of,
-    sample_times,
-)
+from airl_mav.flight import smoothness
 from airl_mav.flight.trajectory import Trajectory
-from airl_mav.latency.deadlines import ages_at_effect, deadline_miss_ratio
+from airl_mav.latency.stages import ages_at_effect, deadline_miss_ratio
 from airl_mav.latency.stamps import SETPOINT
 
 
@@ -57,7 +51,7 @@ class Quality:
     """How many such flights that is."""
     deadline_misses: float | None = None
     """Share of decisions that took effect later than the hold time after their frame was exposed,
-    or never (`latency.deadlines`), 0 to 1. None of this and the following where there is nothing
+    or never (`latency.stages`), 0 to 1. None of this and the following where there is nothing
     to work it out from, and in older records."""
     jerk_rms_m_s3: float | None = None
     """Of the flown velocity, at the bandwidth of `flight.smoothness` [m/s³]."""
@@ -97,19 +91,11 @@ def measure_quality(
     decisions: Mapping[str, NDArray[Any]] | None = None,
     hold_s: float = 0.0,
 ) -> Quality:
-    """Measure an episode.
+    """Measure an episode from its start to the verdict.
 
-    Args:
-        trajectory: The whole episode, take-off included.
-        navigation_us: Start of navigation, simulated time [µs].
-        ended_us: Time of the verdict, simulated [µs].
-        computer_watts: What the computer draws from the pack [W].
-        pack_j: What the pack holds at the start (`Battery.energy_j`) [J]; None: not known.
-        decisions: Columns of the decision log, as in `latency.npz`; None: not known.
-        hold_s: How long an action is held [s]; 0: no decision has a deadline.
-
-    Raises:
-        ValueError: The end comes before the start.
+    `pack_j` is what the pack holds at the start (`Battery.energy_j`) [J]; `decisions` are the
+    columns of the decision log, as in `latency.npz`. Each None if not known. Actions held for 0 s
+    have no deadline.
     """
     if ended_us < navigation_us:
         raise ValueError(f"ended_us={ended_us} lies before navigation_us={navigation_us}")
@@ -142,12 +128,14 @@ def _conduct(
     hold_s: float,
 ) -> dict[str, float | None]:
     """Return the measures of deadlines and smoothness by field; arguments as `measure_quality`."""
-    times_us = sample_times(trajectory, start_us, end_us)
-    flown = jerk_of(flown_velocity(trajectory, times_us))
-    steps = command_steps(decisions)
+    times_us = smoothness.sample_times(trajectory, start_us, end_us)
+    flown = smoothness.jerk_of(smoothness.flown_velocity(trajectory, times_us))
+    steps = smoothness.command_steps(decisions)
     commanded = None
     if SETPOINT in decisions:
-        commanded = jerk_of(commanded_velocity(trajectory, decisions, times_us))
+        commanded = smoothness.jerk_of(
+            smoothness.commanded_velocity(trajectory, decisions, times_us)
+        )
     misses = None
     if hold_s > 0.0:
         misses = deadline_miss_ratio(ages_at_effect(decisions), hold_s * US_PER_S)

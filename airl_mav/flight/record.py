@@ -1,4 +1,4 @@
-"""The record of one episode: one JSON line of `episodes.jsonl`."""
+"""What was flown on what, and the record of one episode: one JSON line of `episodes.jsonl`."""
 
 from __future__ import annotations
 
@@ -9,11 +9,51 @@ from typing import Any
 
 from pydantic import TypeAdapter
 
+from airl_mav.core.constants import US_PER_S, Level
 from airl_mav.core.files import typed
 from airl_mav.core.goals import Goal
 from airl_mav.core.process_use import ProcessUse
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.quality import Quality
+from airl_mav.latency.injection import Injection
+
+BUILT_IN = "built-in"
+"""The firmware of all levels but one."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """One part of a rehearsal: the vehicle, the arena, the policy, the computer."""
+
+    name: str
+    description: str = ""
+
+
+@dataclass(frozen=True)
+class Setup:
+    """The parts of a rehearsal, in words."""
+
+    level: Level
+    """Rung of the fidelity ladder."""
+    vehicle: Part
+    arena: Part
+    policy: Part
+    computer: Part
+    computer_watts: float
+    """What the computer draws from the aircraft's pack [W]; 0 of one that stays on the ground."""
+    injection: Injection
+    """The decision latency t2: measured, injected or estimated."""
+    speed: float | None
+    """Simulated seconds per wall second; None where time is not paced (lockstep)."""
+    between_commands: str
+    """What the vehicle does between commands: `persist`, `hover-after 60 ms`."""
+    firmware: str = BUILT_IN
+    """What flew: the built-in autopilot, or the name of real firmware."""
+    computer_on_ground: bool = False
+    """The computer is ground equipment: the aircraft carries and feeds none."""
+    conditions: str = ""
+    """Wind, load, spread, noise, charge and renderer, where not the defaults: `wind.east_m_s 4`."""
+
 
 SCHEMA = 1
 """Version of the line's schema; docs/run-folder.md describes it."""
@@ -84,6 +124,22 @@ class EpisodeRecord:
     """Fingerprints by lane, and of the whole `flight`; None where flights are never the same."""
     schema: int = SCHEMA
 
+    @property
+    def zero_us(self) -> int:
+        """Start of navigation, or of the episode where navigation never began [µs]."""
+        return self.started_us if self.navigation_us is None else self.navigation_us
+
+    def navigates(self, time_us: int) -> bool:
+        """Return whether the vehicle navigates at a time [µs]."""
+        return self.navigation_us is not None and (self.navigation_us <= time_us < self.ended_us)
+
+    def fault_spans_s(self) -> list[tuple[float, float]]:
+        """Return from when to when each fault acted [s], as time counts from `zero_us`."""
+        return [
+            ((each.from_us - self.zero_us) / US_PER_S, (each.to_us - self.zero_us) / US_PER_S)
+            for each in self.faults
+        ]
+
     def as_data(self) -> dict[str, Any]:
         """Return the object of a line."""
         return asdict(self)
@@ -97,9 +153,8 @@ class EpisodeRecord:
 def run_sha256(episodes: Sequence[EpisodeRecord]) -> str | None:
     """Return the fingerprint of a run: equal when all its flights are equal, bit by bit.
 
-    Returns:
-        SHA-256, hexadecimal, of the flights' own fingerprints in the order of their index, each a
-        line with its newline; None when there is none of a flight.
+    It is the SHA-256, hexadecimal, of the flights' own fingerprints in the order of their index,
+    each a line with its newline; None when there is none of a flight.
     """
     lines = []
     for record in sorted(episodes, key=lambda record: record.index):

@@ -1,6 +1,6 @@
 """What a policy has to reach, and whether its flights show that it does.
 
-A requirement is decided on the 95 % interval of its figure, never on the figure alone: it is met
+A requirement is decided on the 95 % interval of its figure, never on the figure alone. It is met
 where the whole interval fulfils it, not met where none of it does, and undecided between.
 """
 
@@ -128,11 +128,7 @@ class Finding:
 
 
 def parse_requirement(text: str) -> Requirement:
-    """Read a requirement: `success >= 95 %`, `flight_time gap <= 10 %`.
-
-    Raises:
-        FieldError: It is none.
-    """
+    """Read `success >= 95 %` or `flight_time gap <= 10 %`; FieldError if it is no requirement."""
     found = _REQUIREMENT.fullmatch(text)
     if found is None or found["measure"] not in MEASURES:
         raise FieldError("require", text, ACCEPTED)
@@ -152,16 +148,7 @@ def parse_requirement(text: str) -> Requirement:
 
 
 def find(requirement: Requirement, quality: Aggregate, against: PairedComparison | None) -> Finding:
-    """Judge a requirement by the flights of a run.
-
-    Args:
-        requirement: What is asked.
-        quality: Figures of the run.
-        against: The run against its reference on the same seeds; None: there is none.
-
-    Raises:
-        FieldError: A gap is required, and there is no reference.
-    """
+    """Judge a requirement by a run, a gap against its reference; FieldError without any."""
     measure = MEASURES[requirement.measure]
     if requirement.gap:
         if against is None:
@@ -183,11 +170,8 @@ def find(requirement: Requirement, quality: Aggregate, against: PairedComparison
 def settle(finding: Finding, reached: Sequence[bool]) -> Finding:
     """Return a finding as it is where flights were added until a least success rate was decided.
 
-    The interval would be wrong more often than it says: it was looked at again and again.
-
-    Args:
-        finding: What the interval says; other requirements keep it.
-        reached: Whether each flight, in the order of the seeds, was a success.
+    The interval would be wrong more often than it says: it was looked at again and again. `reached`
+    are the flights in the order of their seeds. Findings of other requirements stay.
     """
     if not finding.requirement.least_rate:
         return finding
@@ -221,11 +205,7 @@ def _more_flights(
 ) -> int | None:
     """Return how many more flights of the same figure would decide; None: out of reach.
 
-    Args:
-        requirement: What is asked.
-        estimate: What is known.
-        project: Gives the estimate of n flights of a figure; None: its interval shrinks with the
-            root of n.
+    Unless `project` gives the estimate of n flights, the interval shrinks with the root of n.
     """
     value, low, high = estimate.value, estimate.low, estimate.high
     if value is None:

@@ -18,7 +18,7 @@ import numpy as np
 import scipy
 
 ALPHA = 0.05
-"""Greatest probability of a false verdict over all looks: half of it for "meets" where the rate is
+"""Greatest probability of a false verdict over all looks. Half of it for "meets" where the rate is
 too low, half of it for "does not meet" where it is not, as a 95 % interval shares it out."""
 
 LOOKS = (
@@ -44,7 +44,7 @@ class Decision(str, Enum):
 def error_spent(flights: int) -> float:
     """Return how much error either side may have made by so many flights.
 
-    It grows for ever and never reaches half of `ALPHA`: how many flights there are at most need not
+    It grows for ever and never reaches half of `ALPHA`. How many flights there are at most need not
     be known beforehand.
     """
     return 0.5 * ALPHA * flights / (flights + HALF_SPENT)
@@ -75,13 +75,8 @@ def plan_looks(
     """Give the looks of a test, one after the other.
 
     Both errors are greatest at the threshold itself. There, what campaigns that are still undecided
-    have come to is carried from look to look as a distribution of their failures; as many of its
-    outermost counts decide as the error that may be spent by then permits.
-
-    Args:
-        threshold: Success rate, between 0 and 1, both excluded.
-        looks: Numbers of flights, growing.
-        spent: Error that either side may have made by so many flights.
+    have come to is carried from look to look as a distribution of their failures. As many of its
+    outermost counts decide as `spent` permits. That is the error of either side by so many flights.
     """
     undecided, fewest, before = np.ones(1), 0, 0
     error_few = error_many = 0.0
@@ -119,11 +114,7 @@ class RateTest:
             raise ValueError(f"threshold={self.threshold}: must be > 0 and < 1")
 
     def decide(self, reached: Sequence[bool]) -> Decision:
-        """Return what the first look that decides has shown; later flights do not change it.
-
-        Args:
-            reached: Whether each flight, in the order of the seeds, was a success.
-        """
+        """Return what the first look that decides has shown; later flights do not change it."""
         done = sum(look <= len(reached) for look in LOOKS)
         for look in _planned(self.threshold, done):
             decision = look.decide(look.flights - sum(reached[: look.flights]))
@@ -132,12 +123,7 @@ class RateTest:
         return Decision.UNDECIDED
 
     def flights_needed(self, rate: float, flown: int = 0) -> int | None:
-        """Return after how many flights a rate would decide; None: after none of `LOOKS`.
-
-        Args:
-            rate: Success rate that the flights would keep, 0 to 1.
-            flown: Number of flights that have not decided.
-        """
+        """Return after how many flights a rate would decide; None: after none of `LOOKS`."""
         for look in plan_looks(self.threshold):
             failures = round((1.0 - rate) * look.flights)
             if look.flights > flown and look.decide(failures) is not Decision.UNDECIDED:

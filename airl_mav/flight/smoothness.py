@@ -1,8 +1,8 @@
 """How smoothly a vehicle is commanded and flies: jerk, and the steps of the command.
 
 Jerk is the second derivative of velocity. Of a sampled velocity it depends on the bandwidth that is
-looked at, and the jerk of a commanded velocity, which jumps, is nothing but its steps seen through
-that bandwidth: a step of 1 m/s gives a peak of exp(-1/2) / (sqrt(2 pi) SIGMA_S^2) = 345 m/s³. So
+looked at. The jerk of a commanded velocity, which jumps, is nothing but its steps seen through
+that bandwidth. A step of 1 m/s gives a peak of exp(-1/2) / (sqrt(2 pi) SIGMA_S^2) = 345 m/s³. So
 both are taken alike: sampled at 50 Hz, and differentiated twice with a Gaussian that passes half
 the power at `BANDWIDTH_HZ`.
 """
@@ -85,16 +85,12 @@ def flown_velocity(trajectory: Trajectory, times_us: NDArray[np.int64]) -> NDArr
 def commanded_velocity(
     trajectory: Trajectory, decisions: Mapping[str, NDArray[Any]], times_us: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return the velocity (n, 3) NED [m/s] that was commanded at times (n,) [µs].
+    """Return the velocity (n, 3) NED [m/s] that was commanded at increasing times (n,) [µs].
 
-    A command holds from its sending to the next one's; before the first one the vehicle is told to
+    A command holds from its sending to the next one's. Before the first one the vehicle is told to
     stand still. Commands are in the heading frame: they turn with the vehicle's true heading. Stops
-    that the watchdog makes between commands (`hover_after_s`) are not in it.
-
-    Args:
-        trajectory: The true path, for the heading.
-        decisions: Columns `sent_us` (k,) [µs] and `setpoint` (k, 4), as in `latency.npz`.
-        times_us: Increasing times [µs].
+    that the watchdog makes between commands (`hover_after_s`) are not in it. `decisions` has the
+    columns `sent_us` and `setpoint` of `latency.npz`.
     """
     sent_us, setpoints = _sent(decisions)
     commands = np.vstack([np.zeros(3), setpoints])
@@ -107,7 +103,7 @@ def command_steps(decisions: Mapping[str, NDArray[Any]]) -> NDArray[np.float64]:
     """Return by how much the commanded velocity jumps at each switch of action (k - 1,) [m/s].
 
     The length of the difference between a command and the one before it, of k that were sent. Both
-    are in the heading frame of the moment of the switch, so the length is that of the step in the
+    are in the heading frame of the moment of the switch. So the length is that of the step in the
     world.
     """
     _, setpoints = _sent(decisions)

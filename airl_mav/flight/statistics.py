@@ -51,7 +51,7 @@ SMOOTHNESS = ("jerk_rms_m_s3", "command_step_m_s")
 """The same of these."""
 
 OF_ALL_FLIGHTS = ("deadline_misses",)
-"""Measures of quality whose means are over all valid flights: a late decision counts most where it
+"""Measures of quality whose means are over all valid flights. A late decision counts most where it
 made a flight fail."""
 
 AVERAGED = (*MEANS, "mean_speed_m_s", *PACK_MEASURES, *SMOOTHNESS)
@@ -125,11 +125,8 @@ def bootstrap_interval(
 
     Bias-corrected and accelerated: Efron & Tibshirani, An Introduction to the Bootstrap, 1993,
     section 14.3. The same figures as `scipy.stats.bootstrap`, whose import takes two seconds of
-    processor time, and in memory proportional to n instead of its square.
-
-    Args:
-        samples: Paired samples, each (n,), n >= 2, not all equal.
-        statistic: Takes the means (k,) of each sample and returns values (k,).
+    processor time. It takes memory proportional to n instead of its square. The samples are paired
+    and not all equal, each (n,), n >= 2; `statistic` takes the means (k,) of each.
     """
     n = samples[0].size
     draws = np.random.default_rng(BOOTSTRAP_SEED).integers(0, n, (RESAMPLES, n))
@@ -153,7 +150,7 @@ def bootstrap_interval(
 def median_of(values: ArrayLike) -> Estimate:
     """Return the median of values (n,) with a 95 % interval that supposes nothing of their spread.
 
-    The interval ends at two of the values: the number of values below the true median is binomial
+    The interval ends at two of the values. The number of values below the true median is binomial
     (Conover, Practical Nonparametric Statistics, 3rd ed., 1999, section 3.2). Fewer than six values
     have none.
     """

@@ -69,7 +69,7 @@ class Trajectory:
 
         quaternion = linear(self._continuous_quaternion())
         quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
-        # Power is a mean over the step that ends at a sample: the step a time falls in has it.
+        # Power is a mean over the step that ends at a sample. The step a time falls in has it.
         return Trajectory(
             times, linear(self.position), linear(self.velocity), quaternion, self.power_w[before]
         )
@@ -101,11 +101,7 @@ def pose_at(
 
 
 class TrajectoryRecorder:
-    """Collects the true state tick by tick and keeps it at 50 Hz.
-
-    A tick costs no more than it must: `integrate` every tick, and `keep` when that says so, or at
-    the last moment of an episode.
-    """
+    """Collects the true state of every tick and keeps it at 50 Hz."""
 
     def __init__(self) -> None:
         self._times: list[int] = []
@@ -117,37 +113,10 @@ class TrajectoryRecorder:
         """Since the last sample: power [W] times microseconds."""
         self._power_w = 0.0
 
-    def integrate(self, time_us: int, power_w: float) -> bool:
-        """Take the power of the tick that ends now; return whether a sample is due.
-
-        Args:
-            time_us: Simulated time [µs], later than the call before.
-            power_w: Electrical power over the tick that ends now [W].
-
-        Raises:
-            ValueError: Time does not advance.
-        """
-        last_us = self._last_us
-        self._power_w = power_w
-        if last_us is None:
-            self._last_us = time_us
-            return True
-        if time_us <= last_us:
-            raise ValueError(f"time_us={time_us}: must be later than {last_us}")
-        self._energy_uj += power_w * (time_us - last_us)
-        self._last_us = time_us
-        return time_us - self._kept_us >= SAMPLE_US or not self._times
-
     def extend(
         self, times_us: Sequence[int], powers_w: Sequence[float], states: NDArray[np.float64]
     ) -> list[int]:
-        """Take n ticks; return which of them were sampled.
-
-        Args:
-            times_us: (n,) simulated time [µs].
-            powers_w: (n,) electrical power over the tick that ends then [W].
-            states: (n, >= 10) as `keep` takes them; copied.
-        """
+        """Take n ticks with states (n, >= 10); return which of them were sampled."""
         kept = []
         for k, (time_us, power_w) in enumerate(zip(times_us, powers_w, strict=True)):
             last_us, self._last_us, self._power_w = self._last_us, time_us, power_w
@@ -159,18 +128,14 @@ class TrajectoryRecorder:
         return kept
 
     def keep(self, state: NDArray[np.float64]) -> None:
-        """Sample the moment of the newest `integrate`.
+        """Sample the newest tick, as at the last moment of an episode.
 
-        Args:
-            state: (10,) position NED [m], velocity NED [m/s], quaternion [w, x, y, z] body ->
-                world. Kept as it is, not copied: it must not change afterwards.
-
-        Raises:
-            ValueError: Nothing was integrated yet.
+        `state` (10,) is position NED [m], velocity NED [m/s] and quaternion [w, x, y, z] body ->
+        world. It is not copied: it must not change afterwards.
         """
         time_us = self._last_us
         if time_us is None:
-            raise ValueError("integrate first: a sample has the time of the newest tick")
+            raise ValueError("no tick yet: a sample has the time of the newest one")
         first = not self._times
         passed_us = time_us - self._kept_us
         self._powers.append(self._power_w if first else self._energy_uj / passed_us)

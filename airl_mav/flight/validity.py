@@ -1,7 +1,7 @@
 """Was a flight a test of the policy, or of a host that could not keep up with it?
 
 Flights that live by the wall clock share a machine with everything else that runs there. Where it
-was too busy, or somebody else commanded the vehicle, what was flown says nothing of the policy: it
+was too busy, or somebody else commanded the vehicle, what was flown says nothing of the policy. It
 is flown again, and never counted in silence. The rules are one table, of shares and simulated time.
 """
 
@@ -22,7 +22,7 @@ BY_HAND = "latency or compensation was changed by hand"
 
 LATE_FRAMES = 3.0
 """A frame older than so many camera periods when it is decided on, or a decision that comes so much
-later than the end of the hold time before it, was late: with a host that keeps pace it is one
+later than the end of the hold time before it, was late. With a host that keeps pace it is one
 period and the transport."""
 
 
@@ -77,7 +77,7 @@ RULES = (
         "{:.0f} % of decisions were paced too late (limit {:g} %)",
     ),
 )
-"""What a host must keep to. Ticks are 4 ms apart and camera frames mostly 33 ms; a decision moves a
+"""What a host must keep to. Ticks are 4 ms apart and camera frames mostly 33 ms. A decision moves a
 vehicle at 4 m/s by 0.16 m in 40 ms, a tenth of what a hold time of 0.5 s does."""
 
 
@@ -92,18 +92,13 @@ def host_figures(
     frame_period_us: int,
     excused: Sequence[tuple[int, int]] = (),
 ) -> HostFigures:
-    """Work out what the host did to a flight.
+    """Work out what the host did to a flight, in simulated time.
 
-    Args:
-        flight_us: From the reset to the verdict, without what was given up [simulated µs].
-        slipped_us: Simulated time given up in it [µs].
-        wall_s: Wall time of the same [s]; None: it was not paced.
-        speed: Simulated seconds per wall second asked for.
-        lateness_us: (n,) how late each tick began [simulated µs].
-        decisions: Stamps (k,) by column, as in `latency.npz` [simulated µs].
-        frame_period_us: Between two camera frames [simulated µs].
-        excused: From when to when decisions may be late for what was asked for: faults of the
-            camera, a link or a process, or images that take long to draw [simulated µs].
+    `flight_us` is from the reset to the verdict, without the time given up in it, `slipped_us`;
+    `wall_s` the wall time of the same, None if it was not paced. `lateness_us` (n,) is how late
+    each tick began. `decisions` has stamps by column, as in `latency.npz`. `excused` are the times
+    in which decisions may be late for what was asked for. These are faults of the camera, a link or
+    a process, or images that take long to draw.
     """
     kept = None
     if wall_s and speed:
@@ -124,12 +119,7 @@ def host_figures(
 
 
 def host_faults(figures: HostFigures, strangers: Sequence[str] = ()) -> tuple[str, ...]:
-    """Return why a flight is no test of its policy; empty: it is one.
-
-    Args:
-        figures: What the host did to it.
-        strangers: Who commanded the vehicle without being its companion or a ground station.
-    """
+    """Return why a flight is no test of its policy; `strangers` commanded the vehicle."""
     faults = []
     for rule in RULES:
         value = getattr(figures, rule.figure)
@@ -158,10 +148,7 @@ def _share_beyond(
     limit_us: float,
     excused: Sequence[tuple[int, int]],
 ) -> float | None:
-    """Return the share of intervals longer than a limit; None where there is none.
-
-    Those that any of the excused times falls into are not counted.
-    """
+    """Return the share of intervals longer than a limit, excused times aside; None: none."""
     if start not in stamps or end not in stamps:
         return None
     first, last = stamps[start], stamps[end]

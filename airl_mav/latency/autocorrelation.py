@@ -10,17 +10,10 @@ WINDOW = 5.0
 
 
 def autocorrelation(samples: ArrayLike, lags: int) -> NDArray[np.float64]:
-    """Return the autocorrelation at lags 0 to `lags` (lags + 1,), each in -1..1.
+    """Return the autocorrelation of samples (n,) at lags 0 to `lags` (lags + 1,), each in -1..1.
 
     The biased estimate (every lag divided by n), whose sums stay finite. Samples without any spread
-    have none: 1 at lag 0, then 0.
-
-    Args:
-        samples: (n,) in order of time, n >= 1.
-        lags: Greatest lag, below n.
-
-    Raises:
-        ValueError: There are too few samples for the lag.
+    have none: 1 at lag 0, then 0. Raises ValueError unless n > `lags`.
     """
     values = np.asarray(samples, np.float64)
     if not 0 <= lags < values.size:
@@ -39,19 +32,11 @@ def integrated_time(samples: ArrayLike) -> float:
     """Return the integrated autocorrelation time [decisions], 1 for independent samples.
 
     1 + 2 (rho_1 + ... + rho_M), with Sokal's window: M is the least that is 5 of these times or
-    more (Sokal 1997, Monte Carlo methods in statistical mechanics, section 3). n samples carry as
-    much about the mean as n / time independent ones.
-
-    Args:
-        samples: (n,) in order of time, n >= 2.
+    more (Sokal 1997, Monte Carlo methods in statistical mechanics, section 3). n >= 2 samples carry
+    as much about the mean as n / time independent ones.
     """
     values = np.asarray(samples, np.float64)
     most = values.size // 2
     times = 1.0 + 2.0 * np.cumsum(autocorrelation(values, most)[1:])
     wide = np.flatnonzero(np.arange(1, most + 1) >= WINDOW * times)
     return float(times[wide[0]] if wide.size else times[-1])
-
-
-def independent_below(n: int) -> float:
-    """Return the size that the autocorrelation of n independent samples keeps below in 95 %."""
-    return float(1.96 / np.sqrt(n))

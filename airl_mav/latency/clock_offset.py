@@ -2,9 +2,9 @@
 
 An answer was stamped somewhere between question and reception. So an exchange gives the offset up
 to half its round trip, however unequal the two ways are (F. Cristian, "Probabilistic clock
-synchronization", Distributed Computing 3, 1989), and the one with the least round trip is the best
+synchronization", Distributed Computing 3, 1989). The one with the least round trip is the best
 (the clock filter of NTP, RFC 5905, section 10). A line through the best exchange before and the
-best one after gives the drift; the exchanges in between check it.
+best one after gives the drift. The exchanges in between check it.
 """
 
 from __future__ import annotations
@@ -84,14 +84,7 @@ class Reading:
 
 
 def best_reading(exchanges: Exchanges) -> Reading:
-    """Return the reading of the least round trip that most of the other exchanges agree with.
-
-    Args:
-        exchanges: n >= `LEAST_EXCHANGES`, within seconds.
-
-    Raises:
-        ClockError: There are too few, or no majority agrees.
-    """
+    """Return the reading of the least round trip; ClockError without a majority for it."""
     n = len(exchanges)
     if n < LEAST_EXCHANGES:
         raise ClockError(f"{n} answers in a row, {LEAST_EXCHANGES} are needed")
@@ -148,12 +141,7 @@ class ClockRelation:
 
 
 def relate(before: Exchanges, between: Exchanges, after: Exchanges) -> ClockRelation:
-    """Return the line through the best exchange before and after, checked with those in between.
-
-    Raises:
-        ClockError: There are too few answers, the clocks do not run at the same rate, or the line
-            contradicts the exchanges in between.
-    """
+    """Return the line through the best exchange before and after, checked with those between."""
     first, last = best_reading(before), best_reading(after)
     if len(between) < LEAST_EXCHANGES:
         raise ClockError(f"{len(between)} answers in between, {LEAST_EXCHANGES} are needed")

@@ -17,18 +17,9 @@ from airl_mav.latency.percentiles import MIN_SAMPLES
 
 
 def corrected(samples_us: ArrayLike, expected_us: int) -> NDArray[np.int64]:
-    """Return latencies with those of the decisions that a slow one kept from beginning.
+    """Return latencies [µs] with those of the decisions that a slow one kept from beginning.
 
-    Args:
-        samples_us: (n,) measured latencies [µs].
-        expected_us: Interval at which decisions were meant to begin [µs], > 0.
-
-    Returns:
-        (m,) the samples, and for each one longer than the interval also those of the decisions that
-        were due meanwhile: less one interval each time, down to one interval.
-
-    Raises:
-        ValueError: The interval is not positive.
+    Each longer than the interval is followed by copies of less and less, down to one interval.
     """
     if expected_us <= 0:
         raise ValueError(f"expected_us={expected_us}: must be > 0")
@@ -64,13 +55,7 @@ class CommandAges:
         return float(((b * b - a * a) / 2.0).sum() / (b - a).sum())
 
     def percentile(self, p: float) -> float | None:
-        """Return the age [µs] that the command did not exceed for p percent of the time.
-
-        None with fewer commands than a percentile of decisions needs.
-
-        Raises:
-            KeyError: p is not 50, 90, 99 or 99.9.
-        """
+        """Return the age [µs] not exceeded for p % of the time; None: too few commands."""
         if self.youngest_us.size < MIN_SAMPLES[p] or not self.time_us:
             return None
         return self.quantile(p / 100.0)
@@ -78,8 +63,8 @@ class CommandAges:
     def quantile(self, share: float) -> float:
         """Return the age [µs] not exceeded for a share (0..1) of the time; time must have passed.
 
-        The ages of a command are uniform from its youngest to its oldest, so the distribution is a
-        sum of ramps: between two neighbouring ends it is a straight line.
+        The ages of a command are uniform from its youngest to its oldest. So the distribution is a
+        sum of ramps. Between two neighbouring ends it is a straight line.
         """
         ends = np.sort(np.concatenate([self.youngest_us, self.oldest_us]))
         # Commands that are being aged just above each end.
@@ -100,11 +85,7 @@ def command_ages(
 ) -> CommandAges:
     """Return how old the commands of flights were while they were flown.
 
-    Args:
-        exposed_us: (n,) when the image that each command rests on was exposed [µs].
-        flown_us: (n,) when each took effect [µs], increasing within a flight.
-        flight: (n,) number of the flight of each; None: all of one. The last command of a flight is
-            left out: nothing says how long it was flown.
+    The last command of a flight is left out: nothing says how long it was flown.
     """
     exposed, flown = np.asarray(exposed_us, np.int64), np.asarray(flown_us, np.int64)
     flights = np.zeros(exposed.size, np.int64) if flight is None else np.asarray(flight, np.int64)
@@ -115,14 +96,10 @@ def command_ages(
 
 
 def ages_in_closed_loop(latency_us: ArrayLike, hold_us: int) -> CommandAges:
-    """Return the ages in a loop of which only the latencies are known.
+    """Return the ages in a loop of which only the latencies [µs], in their order, and t3 are known.
 
-    Each decision looks, takes its latency, is held, and the next one begins: a command is `latency`
-    old as it takes effect, and `latency + hold + next latency` as the next one takes over.
-
-    Args:
-        latency_us: (n,) [µs], in their order.
-        hold_us: t3 [µs].
+    A command is `latency` old as it takes effect, and `latency + hold + next latency` as the next
+    one takes over.
     """
     latency = np.asarray(latency_us, np.int64)
     return CommandAges(latency[:-1], latency[:-1] + hold_us + latency[1:])

@@ -18,16 +18,9 @@ from airl_mav.profiles.vehicle import VehicleProfile
 def f1_velocity(period_s: float, sensing_distance_m: float, max_acceleration_m_s2: float) -> float:
     """Return the greatest speed from which the vehicle stops within what it senses [m/s].
 
-    It flies on for a period and then brakes: v T + v² / (2 a) = d, so that
-    v = a (sqrt(T² + 2 d / a) - T). At T = 0 that is the roof, sqrt(2 d a).
-
-    Args:
-        period_s: T, of sensing, computing and acting, >= 0 [s].
-        sensing_distance_m: d, how far ahead an obstacle is taken notice of, > 0 [m].
-        max_acceleration_m_s2: a, greatest deceleration, > 0 [m/s²].
-
-    Raises:
-        ValueError: An argument is out of range.
+    It flies on for a period T and then brakes. v T + v² / (2 a) = d. So v = a (sqrt(T² + 2 d /
+    a) - T). At T = 0 that is the roof, sqrt(2 d a). T is that of sensing, computing and acting, d
+    how far ahead an obstacle is taken notice of, a the greatest deceleration.
     """
     a, d = max_acceleration_m_s2, sensing_distance_m
     if not (period_s >= 0.0 and d > 0.0 and a > 0.0):
@@ -36,15 +29,10 @@ def f1_velocity(period_s: float, sensing_distance_m: float, max_acceleration_m_s
 
 
 def f1_knee_hz(share: float, sensing_distance_m: float, max_acceleration_m_s2: float) -> float:
-    """Return the rate of decisions at which the safe velocity is a share q of its roof [Hz].
+    """Return the rate of decisions at which the safe velocity is a share q of its roof, 0..1 [Hz].
 
     From v = q sqrt(2 d a): f = 1 / T = sqrt(a / (2 d)) 2 q / (1 - q²). Beyond it faster decisions
     gain little.
-
-    Args:
-        share: q, 0 < q < 1.
-        sensing_distance_m: d, > 0 [m].
-        max_acceleration_m_s2: a, > 0 [m/s²].
     """
     a, d = max_acceleration_m_s2, sensing_distance_m
     return math.sqrt(a / (2.0 * d)) * 2.0 * share / (1.0 - share**2)

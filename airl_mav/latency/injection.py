@@ -40,13 +40,7 @@ NOTHING_INJECTED = Injection("measured", "native speed of the machine that flew;
 
 
 def without_timing(chosen: Injection, native_ms: float, level: str) -> Injection:
-    """Return the latency in the words of a level that times nothing.
-
-    Args:
-        chosen: What `choose_injection` gave.
-        native_ms: t2 where nothing is injected [ms].
-        level: Name of the level.
-    """
+    """Return an injection in the words of a level that times nothing; its t2 is `native_ms`."""
     if chosen.latency is not None:
         return chosen
     label = f"{native_ms:g} ms in every decision, as of a desktop computer"
@@ -63,17 +57,11 @@ def choose_injection(
 ) -> Injection:
     """Choose the latency that a policy flies with on a computer.
 
-    Args:
-        computer: The computer to fly as.
-        workload: A workload of its profile: fly as if the computer ran that network. `estimate`
-            scales the workload nearest in multiply-accumulates. None: what was measured for this
-            very policy on that computer, if anything; otherwise nothing is injected.
-        policy_sha256: Digest of the policy file that flies; leave it out when the policy really
-            runs on that computer, so that nothing is added to what is measured.
-        macs: Multiply-accumulates of one inference of that policy; `estimate` needs them.
-
-    Raises:
-        UsageError: The computer has no such workload, or nothing to estimate from.
+    A workload of its profile: as if the computer ran that network; `estimate` scales the workload
+    nearest in multiply-accumulates (`macs` of one inference). None: what was measured for the very
+    policy of a digest, if anything. Otherwise nothing is injected. Leave the digest out when the
+    policy really runs on that computer. Then nothing is added to what is measured. Raises
+    UsageError if the computer has no such workload, or nothing to estimate from.
     """
     if workload is None:
         for name, work in computer.workloads.items():

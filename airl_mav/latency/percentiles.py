@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 
 MIN_SAMPLES: Final = {50.0: 1, 90.0: 64, 95.0: 130, 99.0: 662, 99.9: 6636}
 """Fewest samples for a percentile p: so many that, if the true p-quantile lay above the bound that
-we print, at most one sample over the bound would be a 1 % chance (the early-stopping rule of MLPerf
-LoadGen at 99 % confidence)."""
+we print, at most one sample over the bound would be a 1 % chance. It is the early-stopping rule of
+MLPerf LoadGen at 99 % confidence."""
 
 
 @dataclass(frozen=True)
@@ -28,11 +28,7 @@ class Summary:
 
 
 def percentile(samples: ArrayLike, p: float) -> float | None:
-    """Return the p-th percentile, a value that was seen (nearest rank); None with too few samples.
-
-    Raises:
-        KeyError: p is not 50, 90, 95, 99 or 99.9.
-    """
+    """Return the p-th percentile (nearest rank); None: too few samples."""
     values = np.asarray(samples)
     if values.size < MIN_SAMPLES[p]:
         return None

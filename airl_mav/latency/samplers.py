@@ -74,8 +74,8 @@ class ReplaySampler:
     """Measured latencies in the order they were measured, round and round, from a random place.
 
     The order keeps what a histogram loses: slow decisions come in runs (another process, a hot
-    processor). Every sample is equally likely at every decision, and neighbours stay neighbours:
-    the circular block bootstrap (Politis & Romano 1992) with one block a flight.
+    processor). Every sample is equally likely at every decision, and neighbours stay neighbours.
+    It is the circular block bootstrap (Politis & Romano 1992) with one block a flight.
     """
 
     def __init__(self, samples_us: ArrayLike, rng: np.random.Generator) -> None:
@@ -100,26 +100,12 @@ def lognormal_parameters(mean: float, std: float) -> tuple[float, float]:
 
 
 def latency_generator(seed: int, draw: int = 0) -> np.random.Generator:
-    """Return the generator that an episode's latencies come from, the same at every level.
-
-    Args:
-        seed: Of the episode.
-        draw: 0, or another number for other latencies of the same distribution in an episode that
-            is otherwise the same.
-    """
+    """Return the generator of an episode's latencies; another `draw` gives other ones."""
     return np.random.default_rng((seed, LATENCY_STREAM, draw) if draw else seed)
 
 
 def build_sampler(latency: Latency, rng: np.random.Generator) -> LatencySampler:
-    """Build the sampler of a workload's latency.
-
-    Args:
-        latency: As `load_computer` returns it: with its sample file read in.
-        rng: Source of all draws; the same seed gives the same latencies.
-
-    Raises:
-        ValueError: The latency still names a sample file that was not read.
-    """
+    """Build the sampler of a latency whose sample file `load_computer` has read."""
     if latency.distribution == "samples":
         if latency.samples_ms is None:
             raise ValueError(f"samples_file {latency.samples_file} not read: use load_computer")

@@ -45,18 +45,7 @@ def select_injection(
     policy_sha256: str | None = None,
     macs: int | None = None,
 ) -> Injection:
-    """Choose the latency that a policy flies with: a source written as text, or a computer.
-
-    Args:
-        source: See above; None: as `choose_injection` has it.
-        computer: Computer profile to fly as.
-        workload: See `choose_injection`.
-        policy_sha256: See `choose_injection`.
-        macs: See `choose_injection`.
-
-    Raises:
-        UsageError: There is no such source, computer or workload, or both are given.
-    """
+    """Choose a flight's latency, by a source as text or a computer, or raise UsageError."""
     if source is None:
         return choose_injection(computer, workload, policy_sha256=policy_sha256, macs=macs)
     if workload is not None:
@@ -65,15 +54,7 @@ def select_injection(
 
 
 def parse_latency(text: str, option: str = "--latency") -> Injection:
-    """Return the latency of a source written as text.
-
-    Args:
-        text: See above.
-        option: What it is called in messages.
-
-    Raises:
-        UsageError: Names the option, what was given and what is accepted.
-    """
+    """Return the latency of a source written as text; a UsageError names the option."""
     path = Path(text)
     if path.is_file():
         latency = Latency(distribution="samples", samples_ms=read_samples(path, option))
@@ -92,10 +73,7 @@ def parse_latency(text: str, option: str = "--latency") -> Injection:
 
 
 def longest_ms(latency: Latency) -> float:
-    """Return the longest latency that is reckoned with [ms].
-
-    Of samples the greatest; a distribution without an end is cut at its 99.9 % quantile.
-    """
+    """Return the longest latency [ms]; that of an endless distribution is its 99.9 % quantile."""
     if latency.samples_ms is not None:
         return max(latency.samples_ms)
     mean_ms, std_ms = latency.mean_ms or 0.0, latency.std_ms or 0.0

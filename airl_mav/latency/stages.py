@@ -1,4 +1,4 @@
-"""The stages of a decision: which two stamps each one lies between."""
+"""The stages of a decision: their stamps and durations, and which decisions miss a deadline."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from airl_mav.latency.stamps import NO_STAMP
 
@@ -59,13 +59,10 @@ def stage_durations(
 ) -> dict[str, tuple[NDArray[np.int64], Samples]]:
     """Return the stages of an episode's decisions, by the stage's key.
 
-    Args:
-        stamps: The decision log's columns plus `accepted_us` and `motor_us`, each (n,) [µs].
-
-    Returns:
-        Two arrays (k,): the decisions that have the stage, and its durations [µs]. A stage lacks
-        the decisions where one of its two stamps is `NO_STAMP`, and is empty where a whole column
-        is missing. A decision period belongs to the decision that ends it.
+    Stamps are the decision log's columns plus `accepted_us` and `motor_us`, each (n,) [µs]. Of each
+    stage two arrays (k,): the decisions that have it, and its durations [µs]. A stage lacks the
+    decisions where one of its two stamps is `NO_STAMP`, and is empty where a whole column is
+    missing. A decision period belongs to the decision that ends it.
     """
     nothing: Samples = np.zeros(0, np.int64)
     found = {}
@@ -96,3 +93,83 @@ def pool(episodes: Iterable[Mapping[str, Samples]]) -> dict[str, Samples]:
         )
         for stage in ALL_STAGES
     }
+
+
+def deadline_miss_ratio(latencies: ArrayLike, deadline: float) -> float | None:
+    """Return the share of decisions that miss a deadline, 0 to 1; None: no decisions."""
+    if not deadline > 0.0:
+        raise ValueError(f"deadline={deadline}: must be > 0")
+    values = np.asarray(latencies, np.float64)
+    return float(np.mean(values > deadline)) if values.size else None
+
+
+def ages_at_effect(stamps: Mapping[str, NDArray[Any]]) -> NDArray[np.float64]:
+    """Return the age [µs] of each decision's frame when the decision took effect.
+
+    That is the stage `end_to_end`: exposure of the frame to the first motor command that reflects
+    the decision. A decision that never took effect, although a later one of the flight did, is
+    infinitely old. Those after the last one that took effect are left out.
+    """
+    if "capture_us" not in stamps or "motor_us" not in stamps:
+        return np.zeros(0)
+    captured, moved = stamps["capture_us"], stamps["motor_us"]
+    effective = np.flatnonzero(moved != NO_STAMP)
+    if not effective.size:
+        return np.zeros(0)
+    judged = slice(0, int(effective[-1]) + 1)
+    ages = np.where(moved == NO_STAMP, np.inf, (moved - captured).astype(np.float64))[judged]
+    known: NDArray[np.float64] = ages[captured[judged] != NO_STAMP]
+    return known
+
+
+FENCE_RANGES = 3.0
+"""Interquartile ranges above the third quartile: Tukey's outer fence, beyond which a value is "far
+out" (Exploratory Data Analysis, 1977, section 2D)."""
+
+FENCE_SAMPLES = 16
+"""With fewer samples a quartile has at most four on its far side: no fence is drawn."""
+
+FENCE_SHARE = 0.05
+"""When more lie beyond the fence they are no outliers but a second kind of decision."""
+
+
+def decision_series(stamps: Mapping[str, NDArray[Any]]) -> dict[str, Samples]:
+    """Return the duration [µs] of each decision's stages (n,), `NO_STAMP` where it is unknown."""
+    names = {name for stage in STAGES for name in (stage.start, stage.end)}
+    n = max((len(stamps[name]) for name in names & stamps.keys()), default=0)
+    series: dict[str, Samples] = {}
+    for key, (there, durations) in stage_durations(stamps).items():
+        series[key] = np.full(n, NO_STAMP, np.int64)
+        series[key][there] = durations
+    return series
+
+
+@dataclass(frozen=True)
+class Fence:
+    """Where outliers begin."""
+
+    limit_us: float
+    """A duration above it is an outlier [µs]."""
+    beyond: int
+    """How many lie above it."""
+    n: int
+    second_kind: bool
+    """More lie above it than outliers would: nothing is marked."""
+
+    def marks(self, durations: Samples) -> NDArray[np.bool_]:
+        """Return (k,) which of the durations (k,) [µs] are outliers."""
+        if self.second_kind:
+            return np.zeros(len(durations), np.bool_)
+        above: NDArray[np.bool_] = durations > self.limit_us
+        return above
+
+
+def fence(samples: Samples) -> Fence | None:
+    """Return Tukey's outer fence of durations (n,) [µs]; None with too few for quartiles."""
+    n = len(samples)
+    if n < FENCE_SAMPLES:
+        return None
+    low, high = np.percentile(samples, [25.0, 75.0])
+    limit = float(high + FENCE_RANGES * (high - low))
+    beyond = int(np.count_nonzero(samples > limit))
+    return Fence(limit, beyond, n, second_kind=beyond > FENCE_SHARE * n)

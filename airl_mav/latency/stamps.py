@@ -1,6 +1,6 @@
 """The decision log: one row of stamps a decision. numpy and the standard library only.
 
-Raw integers go into one preallocated block; everything else is worked out after the flight.
+Raw integers go into one preallocated block. Everything else is worked out after the flight.
 Recording costs about 0.3 µs on a desktop core.
 """
 
@@ -46,10 +46,7 @@ class DecisionLog:
     __slots__ = ("_block", "_bytes", "_count", "_setpoints")
 
     def __init__(self, capacity: int = 4096, *, commands: CommandKind = "velocity") -> None:
-        """Reserve room for `capacity` (>= 1) decisions; it doubles when full.
-
-        `commands` is what the setpoints command, a key of `SETPOINTS`.
-        """
+        """Reserve room for `capacity` (>= 1) decisions; it doubles when full."""
         if capacity < 1:
             raise ValueError(f"capacity={capacity}: must be >= 1")
         self._setpoints = SETPOINTS[commands]
@@ -73,16 +70,7 @@ class DecisionLog:
     ) -> None:
         """Append one decision. Times in simulated µs, `NO_STAMP` for one that never came.
 
-        Args:
-            capture_us: Exposure of the frame the decision saw.
-            decoded_us: That frame was decoded in the companion.
-            infer_start_us: Observation encoding and inference began.
-            action_ready_us: The action is known, any injected latency included.
-            sent_us: The setpoint was handed to MAVSDK.
-            held_until_us: End of the time that the action is held before the next observation.
-            setpoint: Velocity north, east, down (or forward, right, down) [m/s] and yaw [rad] or
-                yaw rate [rad/s]; or roll, pitch and yaw [rad], or the body rates [rad/s], and the
-                thrust 0..1: the four numbers the autopilot receives.
+        The setpoint has the four numbers that the autopilot receives, as `SETPOINTS` names them.
         """
         offset = self._count * ROW.itemsize
         if offset == len(self._bytes):

@@ -44,6 +44,11 @@ class UnderWay:
         """When the next one arrives [µs]; None: none is under way."""
         return self._frames[0].capture_time_us + self._transport_us if self._frames else None
 
+    @property
+    def awaited(self) -> bool:
+        """Whether the companion waits for the next exposure."""
+        return not self.published.is_set()
+
     def clear(self) -> None:
         """Forget all frames."""
         self._frames.clear()
@@ -61,6 +66,11 @@ class MemoryCamera:
         self._under_way = UnderWay(transport_us)
         self.publish = self._under_way.send
         self._newest: ReceivedFrame | None = None
+
+    @property
+    def awaited(self) -> bool:
+        """Whether the companion waits for the next exposure."""
+        return self._under_way.awaited
 
     def close(self) -> None:
         """Forget all frames."""
@@ -109,6 +119,11 @@ class TokenCamera:
         self.endpoint = server.endpoint
         self._server = server
         self._newest: Frame | None = None
+
+    @property
+    def awaited(self) -> bool:
+        """Whether the companion waits for the next exposure."""
+        return self.under_way.awaited
 
     def publish(self, frame: Frame) -> None:
         """Send a frame on its way, in simulated time."""

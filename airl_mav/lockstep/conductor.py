@@ -7,6 +7,7 @@ and MAVSDK's repetitions of the newest setpoint. Neither the firmware nor the co
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -68,6 +69,7 @@ class Conductor:
         self._asked: int | None = None
         """The command whose answer the companion waits for."""
         self._answered = threading.Event()
+        self._readable: Callable[[int], object] = lambda _time_us: None
 
     def begin(self, at_us: int) -> None:
         """Give the companion its first turn at simulated `at_us` [µs]."""
@@ -95,13 +97,29 @@ class Conductor:
 
     @property
     def quiet_until_us(self) -> float:
-        """When the companion has its next turn, or MAVSDK repeats the setpoint [µs]."""
-        if self._suspended or self._asked is not None:
+        """When the companion has its next turn [µs]; MAVSDK's repetitions are `arrivals`."""
+        turn = self._turn
+        if self._suspended or self._asked is not None or turn.wake_us is None:
             return 0.0
-        if (interrupt := self._turn.interrupt) is not None and interrupt.is_set():
-            return 0.0
-        due = (self._turn.wake_us, self._inbound.next_repeat_us)
-        return min((time_us for time_us in due if time_us is not None), default=0.0)
+        interrupt = turn.interrupt
+        return 0.0 if interrupt is not None and interrupt.is_set() else turn.wake_us
+
+    @property
+    def arrivals(self) -> Conductor:
+        """Itself: it repeats the setpoint."""
+        return self
+
+    @property
+    def next_us(self) -> float:
+        """When MAVSDK repeats the newest setpoint [µs]; inf = it does not."""
+        repeat_us = self._inbound.next_repeat_us
+        return math.inf if repeat_us is None else repeat_us
+
+    def arrive(self, tick_us: int) -> None:
+        """Deliver the repetitions that are due up to simulated `tick_us` [µs]."""
+        while (repeat_us := self._inbound.next_repeat_us) is not None and repeat_us <= tick_us:
+            self.clock.sleep_until(repeat_us)
+            self._deliver(self._inbound.repeat(repeat_us), self._readable)
 
     def restart(self, tick_us: int) -> None:
         """Set the clock to `tick_us`."""
@@ -119,6 +137,7 @@ class Conductor:
             readable: Makes the vehicle carry out what has arrived, at a given time.
         """
         del sockets
+        self._readable = readable
         if self._wall is not None:
             self._wall.sleep_until(tick_us)
         self._keep(self._vehicle.after_tick(expected=self._asked is not None))

@@ -27,11 +27,10 @@ from airl_mav.lockstep.turns import LockstepError
 from airl_mav.policy.actions import Policy
 from airl_mav.rehearsal.channel import Text
 from airl_mav.rehearsal.episode import faults_of, join_stamps, judged_record, part_of
-from airl_mav.rehearsal.episode_setup import episode_setup
+from airl_mav.rehearsal.episode_setup import episode_setup, state_of
 from airl_mav.rehearsal.progress import Observer
 from airl_mav.rehearsal.run_folder import FIRMWARE_PRINTS, FlownEpisode, RunFolder
 from airl_mav.rehearsal.supervisor import Order, Supervisor
-from airl_mav.rehearsal.true_state import state_of
 from airl_mav.scenario.piloting import TRANSPORT_US
 from airl_mav.scenario.resolved import ResolvedScenario
 from airl_mav.view.ends import ViewEnds

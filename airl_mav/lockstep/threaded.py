@@ -58,6 +58,8 @@ class ThreadPartner:
         self._feed: Callable[[bytes], None] = lambda _: None
         self._heartbeat = b""
         self._barriers = FIRST_BARRIER
+        self._fed = True
+        """Whether MAVSDK was fed anything since the newest barrier."""
         self._interrupted = False
         """Whether the companion, in the middle of its turn, waits for an answer."""
         self._sent_before = 0
@@ -91,6 +93,7 @@ class ThreadPartner:
         """Feed MAVSDK, of states only the newest: it keeps no other for the companion."""
         kept = newest(frames)
         self._heartbeat = newest_heartbeat(kept) or self._heartbeat
+        self._fed = True
         self._feed(b"".join(kept))
 
     def turn(self, now_us: int, handle: Handle) -> Turn:
@@ -98,7 +101,8 @@ class ThreadPartner:
         if self._interrupted:
             self._interrupted = False  # It has its turn still, and its answer now.
         else:
-            self._settle(handle)
+            if self._fed:
+                self._settle(handle)
             self._sent_before = self._setpoints_sent
             self._go.release()
         turn = self._work(handle)
@@ -112,7 +116,7 @@ class ThreadPartner:
 
     def _settle(self, handle: Handle) -> None:
         """Wait until MAVSDK has taken in and sent out everything so far."""
-        number = self._barriers
+        number, self._fed = self._barriers, False
         self._barriers += 1
         ping = self._encoder.pack(dialect.MAVLink_ping_message(0, number, 0, 0))
         wanted = number.to_bytes(4, "little")

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import signal
 import threading
-from contextlib import closing
+from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from airl_mav.core.clock import WallClock
-from airl_mav.core.constants import US_PER_MS
+from airl_mav.core.clock import NS_PER_US, WallClock
+from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.progress import Bar
 from airl_mav.latency.clock_offset import ClockError, ClockRelation, Exchanges, relate
 from airl_mav.latency.stamps import STAMPS
@@ -22,11 +24,12 @@ from airl_mav.profiling.policy_under_test import PolicyUnderTest
 from airl_mav.profiling.request import FLOWN_SPEED_M_S, ProfileRequest
 from airl_mav.rehearsal.signals import signal_handlers
 from airl_mav.scenario.stand_alone import StandAloneCompanion
-from companion.guard import ThreadGuard
 from companion.interfaces import LinkError
+from companion.mavsdk_link import MavsdkLink
 from companion.mission import MissionResult, check_camera, fly_mission
+from companion.periodic import every
 from companion.program import mission_camera, prepare
-from companion.timesync import TimesyncLink
+from companion.watchdog import ThreadGuard
 
 GOAL = 9_000.0, 0.0
 """North, east of the start [m]: out of reach."""
@@ -72,13 +75,7 @@ class DecisionLimit:
 
 
 def measure(request: ProfileRequest, policy: PolicyUnderTest, bar: Bar) -> Recording:
-    """Fly until there are enough decisions; arguments as `bare.measure`.
-
-    Raises:
-        UsageError: The request cannot be flown.
-        ProfilingError: No heartbeat, or the flight ended before there were enough decisions.
-        KeyboardInterrupt: Ctrl-C or SIGTERM; the vehicle was commanded to land.
-    """
+    """Fly until there are enough decisions; Ctrl-C lands. Arguments as `bare.measure`."""
     load_us, first_us, _ = cold_start(request, policy)
     interrupted, stop = threading.Event(), threading.Event()
 
@@ -166,11 +163,9 @@ def _fly(
 def relate_stamps(mission: TimedMission, warm_up: int) -> tuple[Stamps, str, tuple[str, ...]]:
     """Convert the frames' exposure to this computer's clock, if the clocks can be related.
 
-    Returns:
-        Columns after the warm-up, with `exchange_*` columns of one row per exchange in flight; the
-            stamp from which command age counts; remarks. `capture_us` is the exposure by this
-            computer's clock, within `capture_uncertainty_us`, `capture_simulator_us` by the
-            simulator's.
+    Return columns after the warm-up, with `exchange_*` columns of one row per exchange in flight;
+    the stamp from which command age counts; remarks. `capture_us` is the exposure by this
+    computer's clock, within `capture_uncertainty_us`, `capture_simulator_us` by the simulator's.
     """
     columns = mission.result.log.columns()
     stamps = {name: np.asarray(columns[name][warm_up:], np.int64) for name in STAMPS}
@@ -224,3 +219,72 @@ def _relation_remark(mission: TimedMission, relation: ClockRelation, within_us: 
         f"{relation.drift * 1e6:+.1f} ppm (±{relation.drift_uncertainty * 1e6:.1f}), and "
         f"{relation.agreeing} of {relation.checked} exchanges in flight agree"
     )
+
+
+MESSAGE = "TIMESYNC"
+
+AUTOPILOT_COMPONENT = 1
+"""MAV_COMP_ID_AUTOPILOT1: other components of the vehicle may answer too, by other clocks."""
+
+LAST_ANSWER_S = 0.2
+"""Wait for the last answer of a series [s]."""
+
+
+class TimesyncLink(MavsdkLink):
+    """A link that also exchanges TIMESYNC with the flight controller."""
+
+    _system_id: int
+    _pending: set[int]
+    """Times at which the unanswered requests were sent [µs]."""
+    _answered: list[tuple[int, int, int]]
+
+    def connect(self, timeout_s: float, stop: threading.Event | None = None) -> None:
+        """Wait for a flight controller, as `MavsdkLink.connect`."""
+        super().connect(timeout_s, stop)
+        self._pending, self._answered = set(), []
+        self._system_id = self._system.get_system_id()
+        self._hear_messages(MESSAGE, self._hear)
+
+    def exchange(self, count: int, interval_s: float, stop: threading.Event) -> None:
+        """Send requests at an interval [s] after `connect`, and wait for the answers or `stop`."""
+        asked_us = self._clock.time_us()
+        for _ in range(count):
+            if stop.is_set():
+                return
+            self._ask()
+            asked_us += int(interval_s * US_PER_S)
+            self._clock.sleep_until(asked_us, stop)
+        self._clock.sleep_until(self._clock.time_us() + int(LAST_ANSWER_S * US_PER_S), stop)
+
+    def exchanging(self, interval_s: float) -> AbstractContextManager[None]:
+        """Send requests at an interval [s] from a thread, for as long as the context lasts."""
+        return every(int(interval_s * US_PER_S), self._ask, self._clock, "timesync")
+
+    def take_exchanges(self) -> Exchanges:
+        """Return the answered requests since the last call, in the order of the answers."""
+        # Another answer may arrive meanwhile: it stays.
+        taken = self._answered[:]
+        del self._answered[: len(taken)]
+        columns = np.array(taken, np.int64).reshape(-1, 3)
+        return Exchanges(columns[:, 0], columns[:, 1], columns[:, 2])
+
+    def _ask(self) -> None:
+        sent_us = self._clock.time_us()
+        self._pending.add(sent_us)
+        if not self.send_message(MESSAGE, {"tc1": 0, "ts1": sent_us * NS_PER_US}):
+            # Treated as lost.
+            self._pending.discard(sent_us)
+
+    def _hear(self, message: Any, _: object) -> None:
+        """Take an answer; called from a thread of MAVSDK's."""
+        received_us = self._clock.time_us()
+        sender = message.system_id, message.component_id
+        if sender != (self._system_id, AUTOPILOT_COMPONENT):
+            return
+        fields = json.loads(message.fields_json)
+        remote_ns, sent_us = fields["tc1"], fields["ts1"] // NS_PER_US
+        # Requests of the flight controller have no tc1; a second answer is of no use.
+        if remote_ns == 0 or sent_us not in self._pending:
+            return
+        self._pending.discard(sent_us)
+        self._answered.append((sent_us, remote_ns // NS_PER_US, received_us))

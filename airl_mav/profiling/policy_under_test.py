@@ -49,12 +49,7 @@ class PolicyUnderTest:
 
 @contextmanager
 def open_policy(request: ProfileRequest) -> Iterator[PolicyUnderTest]:
-    """Open the policy under test; a random network's files last as long as the context.
-
-    Raises:
-        UsageError: No such policy or vehicle, no fitting camera, or the network is too large.
-            `FieldError`s name the field.
-    """
+    """Open the policy under test; a random network's files last as long as the context."""
     if request.policy is not None and request.network is not None:
         raise FieldError("network", request.network, "either a policy or a network, not both")
     names = [request.vehicle] if request.vehicle else sorted(list_profiles("vehicles"), key=len)

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.machine import NOT_OFFERED
-from airl_mav.latency.autocorrelation import autocorrelation, independent_below, integrated_time
+from airl_mav.latency.autocorrelation import autocorrelation, integrated_time
 from airl_mav.latency.coordinated_omission import corrected
 from airl_mav.latency.percentiles import MIN_SAMPLES, summarize
 from airl_mav.latency.stages import SHOWN_STAGES, Samples
@@ -157,7 +157,8 @@ def correlation_line(t2_us: Samples) -> str:
     """Return whether slow decisions come in runs, as a sentence."""
     lags = [lag for lag in LAGS if lag < t2_us.size]
     rho = autocorrelation(t2_us, lags[-1])
-    bound, time = independent_below(t2_us.size), integrated_time(t2_us)
+    # The autocorrelation of independent samples keeps below this in 95 %.
+    bound, time = 1.96 / np.sqrt(t2_us.size), integrated_time(t2_us)
     values = ", ".join(f"{rho[lag]:+.2f} at {lag}" for lag in lags)
     runs = float(np.abs(rho[1:4]).max()) > bound
     meaning = (

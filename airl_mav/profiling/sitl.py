@@ -56,12 +56,7 @@ class DecisionEstimate(LiveObserver):
 
 
 def measure(request: ProfileRequest, policy: PolicyUnderTest, bar: Bar) -> Recording:
-    """Fly until there are enough decisions; arguments as `bare.measure`.
-
-    Raises:
-        UsageError: The request cannot be flown.
-        ProfilingError: A process was lost too often, or the flights are too short.
-    """
+    """Fly until there are enough decisions; arguments as `bare.measure`."""
     # Before the network is opened for anything else.
     load_us, first_us, later_us = cold_start(request, policy)
     scenario = resolve(

@@ -132,16 +132,11 @@ def soak(
     stop: Callable[[], bool] = lambda: False,
     progress: Callable[[float], None] = lambda _: None,
 ) -> Soak:
-    """Repeat decisions and read the machine's state every second.
+    """Repeat decisions until `stop`, and read the machine's state every second.
 
-    Args:
-        decide: Makes a decision; returns its start and end by the clock [µs].
-        duration_s: Duration, > 0 [s].
-        clock: The clock.
-        read: Reads the machine, never while a decision is timed.
-        state: Returns the state of the machine, before and after.
-        stop: Returns whether to end early, after the first row.
-        progress: Called with the elapsed seconds, each row.
+    `decide` returns a decision's start and end by the clock [µs]. `read` reads the machine, never
+    while a decision is timed, `state` its state before and after. `progress` gets the elapsed
+    seconds, each row.
     """
     before, begun_us = state(), clock.time_us()
     end_us = begun_us + round(duration_s * US_PER_S)

@@ -1,38 +1,31 @@
-"""Drag and wind, from what the air does across the body's axis.
+"""Drag and wind, from the acceleration across the body's axis.
 
-Rotors push along the body's axis, so what accelerates a vehicle across it is the air: with the
-drag D per mass, k = D / m, and the wind w, a velocity v is braked by k (v - w).
+With the drag D per mass, k = D / m, and the wind w, the air brakes a velocity v by k (v - w). The
+rotors push along the body's axis only. Both fits are linear in k and k w.
 
-The vehicle's log holds what the accelerometer felt, in which gravity is not: along the body's x
-and y axes
+The vehicle's log holds the acceleration that is felt, along the body's x and y axes:
 
     a = -k R' (v - w) + b + c (w_y, -w_x)
 
-R' turns from NED to the body's axes. The attitude hardly matters: five milliradians of it change a
-by as much as they turn (v - w). b is the accelerometer's bias, with a normal prior, and is told
-from the wind by flying with several headings. w_x and w_y are the rates of roll and pitch: rotors
-above the centre of mass feel the air that these blow past them, and where a sample is the mean of
-the time since the one before, it is turned by what the vehicle has turned meanwhile. (PX4's own
-estimator tells drag from wind so: EKF2_DRAG_CTRL.)
+R' turns from NED to the body's axes. b is the accelerometer's bias, with a normal prior. Several
+headings tell it from the wind. w_x and w_y are the rates of roll and pitch. Rotors above the centre
+of mass feel their wind. A sample that is a mean is turned by them. (PX4's own estimator tells
+drag from wind so: EKF2_DRAG_CTRL.)
 
-Telemetry has no accelerometer. There the same is found in how the vehicle leans, and what it gains
-of that:
+Telemetry has no accelerometer. There the lean of the vehicle accelerates it.
 
     v' = g + f z - k (v - w)
 
-z is the body's up axis, f the thrust per mass, which the vertical part of the equation gives. The
-level part is averaged over windows of half a second. Here an error of the attitude, as of an
-accelerometer that is biased, looks like wind while the heading stays. It is estimated along with
-the rest, as a bias along the body's axes with a normal prior: of the profile's accelerometer until
-the vehicle has manoeuvred, and smaller after, when an estimator has told tilt and bias apart. So
-the interval of the wind is wide where the flight is short, or the drag small.
-
-Both are linear in k and k w.
+z is the body's up axis, f the thrust per mass, from the vertical part of the equation. The level
+part is averaged over windows of half a second. An error of the attitude looks like wind while the
+heading stays. It is estimated as a bias along the body's axes with a normal prior. That is of the
+profile's accelerometer until the vehicle has manoeuvred, and smaller after. So the interval of the
+wind is wide where the flight is short, or the drag small.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +35,7 @@ from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S
 from airl_mav.latency.autocorrelation import integrated_time
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.refitting.flown import Flown
-from airl_mav.refitting.quantity import Array, FittedQuantity, unobserved
+from airl_mav.refitting.quantity import Array, FittedQuantity
 from airl_mav.vehicle_log.ulog import VehicleLog
 
 WINDOW = 13
@@ -59,19 +52,19 @@ LEARNT_SHARE = 0.6
 first twenty flights of benchmarks/bench_refit.py and 24 of PX4 1.16."""
 
 BY_RATE_M_S = 0.1
-"""How much of a rate the accelerometer may feel as acceleration [m/s² for 1 rad/s]: a thrust of 1 g
+"""How much of a rate the accelerometer may feel as acceleration [m/s² for 1 rad/s]. A thrust of 1 g
 that is turned by a sample's time of 4 ms is 0.04, drag of 0.2 1/s on rotors 10 cm up 0.02."""
 
 OFF_M_S, OFF_S = 0.03, 4.0
 """An estimator's velocity is off by so much along an axis [m/s], and for so long by about the same
-[s]: what PX4 1.16 estimated in twelve simulated flights whose truth is known. The accelerometer's
-equations take it for wind."""
+[s]. That is what PX4 1.16 estimated in twelve simulated flights whose truth is known. The
+accelerometer's equations take it for wind."""
 
 SKEW_S = 0.01
 """By how much attitude and velocity in telemetry may be of different moments [s]."""
 
 UNSEEN = 2.0
-"""Errors of an estimator and gusts change slower than a short flight shows: the variance is so many
+"""Errors of an estimator and gusts change slower than a short flight shows. The variance is so many
 times that which the rows show. Chosen on the first twenty flights of benchmarks/bench_refit.py."""
 
 LEAST_ROWS = 4 * WINDOW
@@ -89,6 +82,13 @@ ITERATIONS = 4
 _DRAG, _NORTH, _EAST = 0, 1, 2
 _AIR = 3
 """Parameters of the air: k, k w north, k w east; biases follow."""
+
+
+DRAG = FittedQuantity("drag_1_s", "drag per mass", "1/s")
+WIND = (
+    FittedQuantity("wind_north_m_s", "wind towards north", "m/s"),
+    FittedQuantity("wind_east_m_s", "wind towards east", "m/s"),
+)
 
 
 @dataclass(frozen=True)
@@ -152,9 +152,7 @@ def fit_air(flown: Flown, vehicle: VehicleProfile, rng: np.random.Generator) -> 
         return _nothing("the flight is too short", known, quadratic_1_m)
     middle, covariance = _posterior(rows, quadratic_1_m)
     drawn = rng.multivariate_normal(middle[:_AIR], covariance[:_AIR, :_AIR], DRAWS)
-    drag = _estimate(
-        "drag_1_s", "drag per mass", "1/s", middle[_DRAG], drawn[:, _DRAG], source, known
-    )
+    drag = _estimate(replace(DRAG, profile=known), middle[_DRAG], drawn[:, _DRAG], source)
     half = drag.half_width or 0.0
     if middle[_DRAG] <= 0.0 or half > WIDEST_DRAG * middle[_DRAG]:
         why = (
@@ -163,50 +161,32 @@ def fit_air(flown: Flown, vehicle: VehicleProfile, rng: np.random.Generator) -> 
         )
         return _nothing(why, known, quadratic_1_m)
     wind = [
-        _estimate(key, meaning, "m/s", middle[i] / middle[_DRAG], drawn[:, i] / drawn[:, 0], source)
-        for i, key, meaning in (
-            (_NORTH, "wind_north_m_s", "wind towards north"),
-            (_EAST, "wind_east_m_s", "wind towards east"),
-        )
+        _estimate(of, middle[i] / middle[_DRAG], drawn[:, i] / drawn[:, _DRAG], source)
+        for of, i in zip(WIND, (_NORTH, _EAST), strict=True)
     ]
     if (half := max(each.half_width or 0.0 for each in wind)) > WIDEST_WIND_M_S:
         why = (
             f"known to {half:.1f} m/s, {WIDEST_WIND_M_S:g} or better is needed: against this drag"
             " an error of the attitude looks like it"
         )
-        wind = [unobserved(each.key, each.meaning, each.unit, why, None) for each in wind]
+        wind = [each.without(why) for each in WIND]
     return Air(drag, wind[0], wind[1], quadratic_1_m)
 
 
 def _nothing(why: str, known: float, quadratic_1_m: float) -> Air:
-    return Air(
-        unobserved("drag_1_s", "drag per mass", "1/s", why, known),
-        unobserved("wind_north_m_s", "wind towards north", "m/s", why, None),
-        unobserved("wind_east_m_s", "wind towards east", "m/s", why, None),
-        quadratic_1_m,
-    )
+    north, east = WIND
+    drag = replace(DRAG, profile=known)
+    return Air(drag.without(why), north.without(why), east.without(why), quadratic_1_m)
 
 
-def _estimate(
-    key: str,
-    meaning: str,
-    unit: str,
-    value: float,
-    drawn: Array,
-    source: str,
-    profile: float | None = None,
-) -> FittedQuantity:
-    low, high = np.quantile(drawn, (0.025, 0.975))
-    return FittedQuantity(
-        key, meaning, unit, float(value), float(low), float(high), source, "", profile
-    )
+def _estimate(of: FittedQuantity, value: float, drawn: Array, source: str) -> FittedQuantity:
+    return of.found((value, *np.quantile(drawn, (0.025, 0.975))), source)
 
 
 def _felt_rows(flown: Flown, bias_m_s2: float) -> _Rows | None:
     """Return the equations of the accelerometer across the body's axis, if logged.
 
-    The sensor's raw data are corrected by the estimator's final bias, since its bias in flight
-    changes as it learns.
+    The raw data are corrected by the estimator's final bias, as its bias changes while it learns.
     """
     log = flown.log
     if log is None:
@@ -243,8 +223,8 @@ def _learnt_bias(log: VehicleLog, start_us: float, end_us: float) -> Array | Non
 def _lean_rows(flown: Flown, bias_m_s2: float) -> _Rows | None:
     """Return the equations of telemetry: velocity gained in a window against lean and drag.
 
-    An estimator's attitude and velocity differ slightly in time. In oscillating flight, a lean that
-    is early by d looks like a drag of d w², w the angular frequency, so d is estimated too.
+    In oscillating flight, a lean that is early by d looks like a drag of d w², w the angular
+    frequency. So d is estimated, too.
     """
     path = flown.path.between(*flown.airborne_us)
     if len(path) < LEAST_ROWS:

@@ -55,11 +55,7 @@ def overrides_of(
     air: Air,
     logged: Mapping[str, float],
 ) -> tuple[Override, ...]:
-    """Return the parameters in which a flight differs from its profile.
-
-    `flying` is the profile with the computer that flew along, `logged` the parameters of the flight
-    controller from its log.
-    """
+    """Return the parameters in which a flight differs from the vehicle's profile."""
     found: list[Override] = []
     carried_kg = flying.body.mass_kg - profile.body.mass_kg
     mass_kg = flying.body.mass_kg
@@ -204,19 +200,7 @@ def write_refit(
     samples_ms: Sequence[float],
     remarks: Sequence[str],
 ) -> None:
-    """Write the files of a refit into a folder, `refit.json` last.
-
-    Args:
-        out: New or empty folder.
-        data: Content of `refit.json`.
-        vehicle: The vehicle's profile as TOML.
-        computer: The computer; None = not written.
-        samples_ms: t2 of the decisions; empty = not written.
-        remarks: Sources of the data.
-
-    Raises:
-        OSError: They cannot be written.
-    """
+    """Write the files of a refit into a new or empty folder, `refit.json`, made of `data`, last."""
     out.mkdir(parents=True, exist_ok=True)
     replace_file(out / VEHICLE_FILE, vehicle.encode())
     scenario: dict[str, Any] = {"vehicle": str((out / VEHICLE_FILE).absolute())}

@@ -138,11 +138,7 @@ def _logged_path(log: VehicleLog) -> Trajectory:
 def _velocity_setpoints(
     log: VehicleLog, start_us: int, end_us: int
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the longest sequence of setpoints that command velocity alone, as in `Flown`.
-
-    Smooth plans with feed-forward do not show the vehicle's response time, so position and
-    acceleration setpoints are left out.
-    """
+    """Return the longest run of setpoints by velocity alone, as plans hide the response."""
     tracked = log.setpoint.between(start_us, end_us)
     steered = np.isfinite(tracked.values[:, :3]).all(axis=1)
     steered &= log.nav_state.newest(tracked.time_us)[:, 0] == OFFBOARD
@@ -168,11 +164,7 @@ def seconds(times_us: NDArray[np.int64], from_us: int) -> NDArray[np.float64]:
 
 
 def _airborne_us(path: Trajectory, navigation_us: int, ended_us: int) -> tuple[int, int]:
-    """Return the airborne interval around the navigation [µs].
-
-    Ground level is the start of the recording if that was before take-off; otherwise only the
-    navigation counts.
-    """
+    """Return the airborne interval around the navigation [µs], or the navigation itself."""
     high = path.position[:, 2] < path.position[0, 2] - AIRBORNE_M
     at = min(int(np.searchsorted(path.time_us, navigation_us)), len(path) - 1)
     if not high[at]:

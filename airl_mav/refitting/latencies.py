@@ -12,11 +12,15 @@ from scipy.stats import bootstrap
 from airl_mav.core.constants import US_PER_MS
 from airl_mav.latency.autocorrelation import integrated_time
 from airl_mav.latency.stamps import NO_STAMP
-from airl_mav.refitting.quantity import LEVEL, RESAMPLES, FittedQuantity, unobserved
+from airl_mav.refitting.quantity import LEVEL, RESAMPLES, FittedQuantity
 from airl_mav.vehicle_log.alignment import Alignment
 
 LEAST = 5
 """Decisions below which a mean has no interval."""
+
+T1 = FittedQuantity("t1_ms", "t1, mean", "ms")
+T2 = FittedQuantity("t2_ms", "t2, mean", "ms")
+LINK = FittedQuantity("link_ms", "link, both ways", "ms")
 
 
 @dataclass(frozen=True)
@@ -36,12 +40,7 @@ class Latencies:
 def no_latencies() -> Latencies:
     """Return what a vehicle's log alone tells of them: nothing."""
     why = "a vehicle's log holds no decisions: give the black box"
-    return Latencies(
-        unobserved("t1_ms", "t1, mean", "ms", why, None),
-        unobserved("t2_ms", "t2, mean", "ms", why, None),
-        unobserved("link_ms", "link, both ways", "ms", why, None),
-        (),
-    )
+    return Latencies(T1.without(why), T2.without(why), LINK.without(why), ())
 
 
 def fit_latencies(
@@ -53,63 +52,35 @@ def fit_latencies(
     t1_us = (stamps["decoded_us"] - stamps["capture_us"])[stamped]
     # A clock of whole microseconds may give 0 for what is faster.
     samples_ms = np.maximum(t2_us, 1) / US_PER_MS
-    stamps_of = "stamps of {} decisions"
-    return Latencies(
-        _mean(
-            "t1_ms",
-            "t1, mean",
-            t1_us / US_PER_MS,
-            stamps_of.format(len(t1_us)),
-            "the camera does not stamp by the companion's clock",
-            rng,
-        ),
-        _mean(
-            "t2_ms",
-            "t2, mean",
-            samples_ms,
-            stamps_of.format(len(samples_ms)),
-            "no decision was recorded",
-            rng,
-        ),
-        _link(clocks),
-        tuple(float(each) for each in samples_ms),
-    )
+    unstamped = "the camera does not stamp by the companion's clock"
+    t1 = _mean(T1, t1_us / US_PER_MS, unstamped, rng)
+    t2 = _mean(T2, samples_ms, "no decision was recorded", rng)
+    return Latencies(t1, t2, _link(clocks), tuple(float(each) for each in samples_ms))
 
 
 def _mean(
-    key: str,
-    meaning: str,
-    values_ms: NDArray[np.float64],
-    source: str,
-    none: str,
-    rng: np.random.Generator,
+    of: FittedQuantity, values_ms: NDArray[np.float64], none: str, rng: np.random.Generator
 ) -> FittedQuantity:
     """Return the mean with its interval, wider by how much decisions depend on each other."""
     if len(values_ms) < LEAST:
         why = f"{len(values_ms)} decisions; {LEAST} are needed" if len(values_ms) else none
-        return unobserved(key, meaning, "ms", why, None)
-    mean = float(values_ms.mean())
+        return of.without(why)
+    mean, source = float(values_ms.mean()), f"stamps of {len(values_ms)} decisions"
     if np.ptp(values_ms) == 0.0:
-        return FittedQuantity(key, meaning, "ms", mean, mean, mean, source)
+        return of.found((mean, mean, mean), source)
     found = bootstrap(
         (values_ms,), np.mean, n_resamples=RESAMPLES, confidence_level=LEVEL, rng=rng
     ).confidence_interval
     wider = float(np.sqrt(max(1.0, integrated_time(values_ms))))
     low, high = (mean + wider * (float(end) - mean) for end in (found.low, found.high))
-    return FittedQuantity(key, meaning, "ms", mean, low, high, source)
+    return of.found((mean, low, high), source)
 
 
 def _link(clocks: Alignment | None) -> FittedQuantity:
-    key, meaning = "link_ms", "link, both ways"
     if clocks is None:
-        why = "a black box knows neither end of it: give the vehicle's log"
-        return unobserved(key, meaning, "ms", why, None)
+        return LINK.without("a black box knows neither end of it: give the vehicle's log")
     if clocks.round_trip_us is None or clocks.accepted_range_us is None:
-        why = f"{clocks.setpoints} setpoints were seen in the log"
-        return unobserved(key, meaning, "ms", why, None)
-    low_us, high_us = (clocks.told_us + end for end in clocks.accepted_range_us)
+        return LINK.without(f"{clocks.setpoints} setpoints were seen in the log")
+    low_ms, high_ms = ((clocks.told_us + end) / US_PER_MS for end in clocks.accepted_range_us)
     source = f"{clocks.setpoints} setpoints and the telemetry, found again in the vehicle's log"
-    value_ms, low_ms, high_ms = (
-        each / US_PER_MS for each in (clocks.round_trip_us, low_us, high_us)
-    )
-    return FittedQuantity(key, meaning, "ms", value_ms, low_ms, high_ms, source)
+    return LINK.found((clocks.round_trip_us / US_PER_MS, low_ms, high_ms), source)

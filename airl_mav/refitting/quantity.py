@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,7 @@ class FittedQuantity:
     key: str
     meaning: str
     unit: str
-    value: float | None
+    value: float | None = None
     """None: not observable in this flight."""
     low: float | None = None
     high: float | None = None
@@ -51,12 +51,14 @@ class FittedQuantity:
             return None
         return 0.5 * (self.high - self.low)
 
+    def found(self, ends: Iterable[float], source: str) -> FittedQuantity:
+        """Return it with a value, the low and the high end of its interval, and their source."""
+        value, low, high = map(float, ends)
+        return replace(self, value=value, low=low, high=high, source=source)
 
-def unobserved(
-    key: str, meaning: str, unit: str, why: str, profile: float | None
-) -> FittedQuantity:
-    """Return a quantity that the flight does not tell, and why."""
-    return FittedQuantity(key, meaning, unit, None, unobservable=why, profile=profile)
+    def without(self, why: str) -> FittedQuantity:
+        """Return it as not observable."""
+        return replace(self, value=None, low=None, high=None, source="", unobservable=why)
 
 
 def block_intervals(
@@ -64,15 +66,9 @@ def block_intervals(
 ) -> Array:
     """Return the offsets of 95 % intervals from a least-squares solution, lower and upper (2, k).
 
-    Neighbouring residuals are correlated, so blocks of seconds are resampled; each resample moves
+    Neighbouring residuals are correlated. So blocks of seconds are resampled. Each resample moves
     the solution by one Gauss-Newton step (one-step bootstrap). Student's t accounts for the few
     blocks. Unobservable parameters have infinite intervals.
-
-    Args:
-        jacobian: (n, k) of the residuals.
-        residuals: (n,) at the solution.
-        times_s: (n,) of the residuals [s].
-        rng: Generator of the resamples.
     """
     block = np.unique(np.floor((times_s - times_s.min()) / BLOCK_S), return_inverse=True)[1]
     count = int(block.max()) + 1

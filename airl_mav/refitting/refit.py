@@ -17,15 +17,8 @@ from airl_mav.profiles.computer import ComputerProfile, load_computer
 from airl_mav.profiles.conditions import Payload
 from airl_mav.profiles.loaded import loaded
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
+from airl_mav.refitting import files
 from airl_mav.refitting.air import Air, fit_air
-from airl_mav.refitting.files import (
-    Override,
-    computer_profile,
-    overrides_of,
-    refitted,
-    vehicle_toml,
-    write_refit,
-)
 from airl_mav.refitting.flown import Flown, flown_by_log, flown_of
 from airl_mav.refitting.latencies import Latencies, fit_latencies, no_latencies
 from airl_mav.refitting.quantity import FittedQuantity
@@ -54,7 +47,7 @@ class Refit:
     known: Known
     """Which of mass and thrust that profile was believed about."""
     vehicle: VehicleProfile
-    overrides: tuple[Override, ...]
+    overrides: tuple[files.Override, ...]
     response: ResponseFit
     thrust: Thrust
     air: Air
@@ -154,13 +147,13 @@ def refit(
     thrust = fit_thrust(flown, flying, air, known, streams[1])
     response = fit_response(flown, profile.response, streams[2])
     parameters = {} if flown.log is None else flown.log.parameters
-    overrides = overrides_of(profile, flying, response, thrust, air, parameters)
+    overrides = files.overrides_of(profile, flying, response, thrust, air, parameters)
     found = Refit(
         black_box=None if box is None else path,
         ulg=ulg,
         base=base,
         known=known,
-        vehicle=refitted(profile, overrides),
+        vehicle=files.refitted(profile, overrides),
         overrides=overrides,
         response=response,
         thrust=thrust,
@@ -196,10 +189,10 @@ def _write(found: Refit, box: BlackBox | None, board: ComputerProfile, out: Path
     from_what = " and ".join(each.name for each in sources)
     remarks = (f"airl refit {from_what}", *found.notes)
     samples_ms = found.latencies.samples_ms
-    write_refit(
+    files.write_refit(
         out,
         found.as_json(),
-        vehicle_toml(
+        files.vehicle_toml(
             found.base,
             f"{found.base}, refitted to {sources[0].stem}",
             found.overrides,
@@ -207,7 +200,7 @@ def _write(found: Refit, box: BlackBox | None, board: ComputerProfile, out: Path
         ),
         None
         if box is None
-        else computer_profile(box, board, len(samples_ms), f"airl refit {from_what}"),
+        else files.computer_profile(box, board, len(samples_ms), f"airl refit {from_what}"),
         samples_ms,
         remarks,
     )

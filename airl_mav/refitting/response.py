@@ -19,7 +19,7 @@ from airl_mav.core.frames import quats_to_euler
 from airl_mav.flight.statistics import QUANTILE
 from airl_mav.profiles.vehicle import Response
 from airl_mav.refitting.flown import Flown, seconds
-from airl_mav.refitting.quantity import Array, FittedQuantity, block_intervals, unobserved
+from airl_mav.refitting.quantity import Array, FittedQuantity, block_intervals
 
 STEP_S = 0.004
 """Of the model [s]: the flight controller's own."""
@@ -36,6 +36,12 @@ LEAST_CHANGE_M_S, LEAST_CHANGE_RAD_S = 1.0, 0.2
 DIFFERENCES = (0.02, 0.02, 0.02)
 """Steps of the numerical derivatives, as shares: the model is piecewise linear in the dead time."""
 
+TIMES = {
+    "dead_time_s": "dead time",
+    "velocity_time_s": "velocity's time constant",
+    "yaw_rate_time_s": "yaw rate's time constant",
+}
+
 LEAST_DECISIONS = 8
 WIDEST_S, WIDEST_SHARE = 0.05, 0.4
 """A dead time that is known no better, or a time constant, is not observable."""
@@ -51,11 +57,7 @@ class ResponseFit:
 
     def response(self, drag_1_s: float, known: Response | None) -> Response | None:
         """Return the table for a profile, unobserved values from `known`; None if unknown."""
-        found = {
-            "dead_time_s": self.dead_time_s.value,
-            "velocity_time_s": self.velocity_time_s.value,
-            "yaw_rate_time_s": self.yaw_rate_time_s.value,
-        }
+        found = {name: getattr(self, name).value for name in TIMES}
         held = {} if known is None else known.model_dump()
         merged = {name: held.get(name) if value is None else value for name, value in found.items()}
         if any(value is None for value in merged.values()):
@@ -95,34 +97,17 @@ class _Solution:
 
 
 def fit_response(flown: Flown, known: Response | None, rng: np.random.Generator) -> ResponseFit:
-    """Fit the response of a flight's vehicle; `known` is the profile's.
-
-    With the vehicle's log the dead time counts from when the flight controller took the setpoint;
-    otherwise it includes the link.
-    """
-    velocity, turn = _describe(known)
-    if (why := _too_little(flown)) is not None:
-        fit = ResponseFit(*(replace(each, unobservable=why) for each in (*velocity, turn)))
-    else:
-        driven = _driven(flown)
-        fit = ResponseFit(
-            *_velocity(driven, flown, velocity, rng), _yaw_rate(driven, flown, turn, rng)
-        )
-    return fit
-
-
-def _describe(
-    known: Response | None,
-) -> tuple[tuple[FittedQuantity, FittedQuantity], FittedQuantity]:
+    """Fit the response of a flight's vehicle; without its log the dead time includes the link."""
     held = {} if known is None else known.model_dump()
-
-    def named(key: str, meaning: str) -> FittedQuantity:
-        return unobserved(key, meaning, "s", "", held.get(key))
-
-    return (
-        named("dead_time_s", "dead time"),
-        named("velocity_time_s", "velocity's time constant"),
-    ), named("yaw_rate_time_s", "yaw rate's time constant")
+    dead, lag, turn = (
+        FittedQuantity(key, meaning, "s", profile=held.get(key)) for key, meaning in TIMES.items()
+    )
+    if (why := _too_little(flown)) is not None:
+        return ResponseFit(dead.without(why), lag.without(why), turn.without(why))
+    driven = _driven(flown)
+    return ResponseFit(
+        *_velocity(driven, flown, (dead, lag), rng), _yaw_rate(driven, flown, turn, rng)
+    )
 
 
 def _too_little(flown: Flown) -> str | None:
@@ -177,8 +162,8 @@ def _velocity(
 ) -> tuple[FittedQuantity, FittedQuantity]:
     """Fit dead time and time constant to the velocities north and east together.
 
-    A companion's setpoints are in the heading frame, so the heading's time is a third parameter:
-    their arrival, before the response. Logged setpoints are already in the world frame.
+    A companion's setpoints are in the heading frame. So the time of the heading, their arrival, is
+    a third parameter. Logged setpoints are in the world frame.
     """
     grid = driven.grid_s
 
@@ -202,7 +187,7 @@ def _velocity(
     shift_s, unsure_s, source = _link_share(flown)
     low_s, high_s = (math.hypot(end, unsure_s) for end in ends[:, 0])
     value = float(found.x[0]) - shift_s
-    dead = replace(dead, value=value, low=value - low_s, high=value + high_s, source=source)
+    dead = dead.found((value, value - low_s, value + high_s), source)
     lag = _with_interval(lag, float(found.x[1]), ends[:, 1], f"velocity in {flown.told_by}")
     return _known_to(dead, WIDEST_S), _known_to(lag, max(WIDEST_S, WIDEST_SHARE * found.x[1]))
 
@@ -245,7 +230,7 @@ def _yaw_rate(
     rms = _rms(_changes(flown)[:, 3:])
     if rms < LEAST_CHANGE_RAD_S:
         why = f"yaw rates change by {rms:.2f} rad/s; {LEAST_CHANGE_RAD_S:g} are needed"
-        return replace(known, unobservable=why)
+        return known.without(why)
     grid = driven.grid_s
 
     def residuals(of: Array) -> Array:
@@ -288,13 +273,7 @@ def _best(
 
 
 def _with_interval(known: FittedQuantity, value: float, ends: Array, source: str) -> FittedQuantity:
-    return replace(
-        known,
-        value=value,
-        low=value + float(ends[0]),
-        high=value + float(ends[1]),
-        source=source,
-    )
+    return known.found((value, value + ends[0], value + ends[1]), source)
 
 
 def _known_to(estimate: FittedQuantity, widest: float) -> FittedQuantity:

@@ -1,8 +1,7 @@
 """A vehicle's profile from several flights' logs together.
 
-Each flight is fitted alone; what it tells of the vehicle is then averaged. Flights of one vehicle
-differ by more than their intervals say, so the mean is that of a random-effects model: a flight's
-value differs from the vehicle's by its own error, and by a spread that all of them share
+Each flight is fitted alone. The mean of a random-effects model joins them. There a flight's value
+differs from the vehicle's by its own error. It also differs by a spread that all of them share
 (DerSimonian and Laird, Meta-analysis in clinical trials, Controlled Clinical Trials 7, 1986).
 """
 
@@ -18,12 +17,12 @@ import numpy as np
 from airl_mav.core.errors import FieldError
 from airl_mav.flight.statistics import QUANTILE
 from airl_mav.profiles.vehicle import load_vehicle
-from airl_mav.refitting.air import Air
+from airl_mav.refitting.air import WIND, Air
 from airl_mav.refitting.files import overrides_of, refitted, vehicle_toml, write_refit
 from airl_mav.refitting.latencies import no_latencies
-from airl_mav.refitting.quantity import Array, FittedQuantity, unobserved
+from airl_mav.refitting.quantity import Array, FittedQuantity
 from airl_mav.refitting.refit import LOG_SUFFIX, Refit, check_out, refit
-from airl_mav.refitting.response import ResponseFit
+from airl_mav.refitting.response import TIMES, ResponseFit
 from airl_mav.refitting.thrust import Known, thrust_of
 
 OWN_WIND = "each flight has its own"
@@ -60,18 +59,12 @@ def refit_together(
     base = flights[0].base
     profile = load_vehicle(base)
     response = ResponseFit(
-        *(
-            pooled([getattr(each.response, name) for each in flights])
-            for name in ("dead_time_s", "velocity_time_s", "yaw_rate_time_s")
-        )
+        *(pooled([getattr(each.response, name) for each in flights]) for name in TIMES)
     )
     thrust = thrust_of(pooled([each.thrust.ratio_m_s2 for each in flights]), profile, known)
-    winds = [
-        unobserved(each.key, each.meaning, each.unit, OWN_WIND, None)
-        for each in (flights[0].air.wind_north_m_s, flights[0].air.wind_east_m_s)
-    ]
+    north, east = (each.without(OWN_WIND) for each in WIND)
     drag = pooled([each.air.drag_1_s for each in flights])
-    air = Air(drag, winds[0], winds[1], flights[0].air.quadratic_1_m)
+    air = Air(drag, north, east, flights[0].air.quadratic_1_m)
     parameters = flights[-1].parameters
     overrides = overrides_of(profile, profile, response, thrust, air, parameters)
     changed = sorted(
@@ -116,7 +109,7 @@ def pooled(alone: Sequence[FittedQuantity]) -> FittedQuantity:
     value, error = random_effects(values, sigma)
     half = QUANTILE * error
     source = f"{len(told)} of {len(alone)} flights: {told[0].source}"
-    return replace(told[0], value=value, low=value - half, high=value + half, source=source)
+    return told[0].found((value, value - half, value + half), source)
 
 
 def random_effects(values: Array, sigma: Array) -> tuple[float, float]:

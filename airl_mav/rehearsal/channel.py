@@ -1,6 +1,6 @@
 """The control channel between the harness and a process it supervises: JSON lines over pipes.
 
-Requests go to the child's standard input, events come from its standard output; what the child
+Requests go to the child's standard input, events come from its standard output. What the child
 wants to say to people goes to standard error. The end of standard input means that the harness is
 gone: the child ends. Because it is only pipes, the same channel runs through `ssh`.
 """
@@ -166,10 +166,7 @@ class LogLost(_Line):
 
 
 class Due(_Line):
-    """A fault of a process begins or ends now: the rehearsal carries it out.
-
-    The firmware has saved the episode's arrays, as at `FinishEpisode`, when it is to be killed.
-    """
+    """A process's fault begins or ends; a firmware to be killed has saved its arrays."""
 
     type: Literal["due"] = "due"
     time_us: int
@@ -248,11 +245,7 @@ class ChildChannel:
 
     @classmethod
     def on_stdio(cls) -> ChildChannel:
-        """Take over standard input and output.
-
-        File descriptor 1 is pointed at standard error afterwards, so that a library that prints
-        (pybullet does, from C) cannot garble the channel.
-        """
+        """Take over standard input and output, so that no library's output garbles the channel."""
         outgoing = os.fdopen(os.dup(1), "wb", buffering=0)
         os.dup2(2, 1)
         # Unbuffered: the reading thread must hold no lock that the end of the interpreter wants.
@@ -267,11 +260,7 @@ class ChildChannel:
             return
 
     def begin(self) -> Begin | None:
-        """Wait for what this process is to be; None when the rehearsal is gone before it said so.
-
-        Raises:
-            UsageError: The first line is something else.
-        """
+        """Wait for the first line, or None when the rehearsal is gone before it."""
         line = self._incoming.readline()
         if not line:
             return None
@@ -283,8 +272,7 @@ class ChildChannel:
     def listen(self, handle: Callable[[Any], None], gone: Callable[[], None]) -> None:
         """Call `handle` for every request, on a thread; `gone` when the harness is gone.
 
-        A line that is no request is passed over, as the harness does with events. `gone` is also
-        called when `handle` fails: nobody would hear the end of the harness any more.
+        `gone` is also called when `handle` fails: then nobody would hear the end of the harness.
         """
 
         def loop() -> None:
@@ -303,15 +291,7 @@ class ChildChannel:
 
 
 def serve(work: Callable[[Begin, ChildChannel], None], lost: type[Exception]) -> int:
-    """Be a child process: take its first line, work, and say why it failed.
-
-    Args:
-        work: What it does, from its first line to its end.
-        lost: What `work` raises where a new process may do better.
-
-    Returns:
-        Its exit status.
-    """
+    """Be a child process: take its first line, work, and say why it failed; return its status."""
     channel = ChildChannel.on_stdio()
     # The rehearsal decides when to end, also on Ctrl-C: it closes the pipe.
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -1,7 +1,4 @@
-"""The companion process of a rehearsal: MAVSDK, camera and policy, missions on request.
-
-Its standard input brings the resolved scenario in one line, then requests; see `rehearsal.channel`.
-"""
+"""The companion process of a rehearsal: MAVSDK, camera and policy, missions on request."""
 
 from __future__ import annotations
 
@@ -20,24 +17,14 @@ from airl_mav.core.errors import EXIT_BROKEN
 from airl_mav.core.files import save_arrays
 from airl_mav.core.ports import LOOPBACK
 from airl_mav.core.process_use import UseMeter
-from airl_mav.rehearsal.channel import (
-    Abort,
-    Begin,
-    ChildChannel,
-    Ended,
-    Fly,
-    Progress,
-    Ready,
-    Shutdown,
-    serve,
-)
+from airl_mav.rehearsal import channel
 from airl_mav.scenario.resolved import ResolvedScenario
 from companion.camera import open_camera
-from companion.guard import ThreadGuard
 from companion.interfaces import LinkError
 from companion.mavsdk_link import MavsdkLink
 from companion.mission import check_camera, fly_mission
 from companion.signing_proxy import signed
+from companion.watchdog import ThreadGuard
 
 if TYPE_CHECKING:  # A companion that nobody watches need not load it.
     from airl_mav.view.taps import CompanionTap
@@ -50,30 +37,29 @@ class Missions:
     """Flies missions; link and camera stay open for all of them."""
 
     def __init__(
-        self, scenario: ResolvedScenario, channel: ChildChannel, tap: CompanionTap | None = None
+        self,
+        scenario: ResolvedScenario,
+        harness: channel.ChildChannel,
+        tap: CompanionTap | None = None,
     ) -> None:
-        """Load the policy; nothing is connected yet.
-
-        A `tap` shows the decisions, to those who may set how late they are. Raises UsageError if
-        the policy cannot be run.
-        """
+        """Load the policy, or raise UsageError; nothing is connected yet."""
         self._scenario = scenario
         self._tap = tap
-        self._channel = channel
+        self._harness = harness
         self._clock = WallClock(scenario.speed or 1.0)
         self._requests: queue.Queue[Any] = queue.Queue()
         self._stop, self._abandon = threading.Event(), threading.Event()
 
     def handle(self, request: Any) -> None:
         """Take a request, on the channel's thread."""
-        if isinstance(request, Abort):
+        if isinstance(request, channel.Abort):
             (self._stop if request.land else self._abandon).set()
             self._stop.set()
             return
-        if isinstance(request, Fly):
+        if isinstance(request, channel.Fly):
             self._stop.clear()
             self._abandon.clear()
-            # Shared for one flight, then left alone: what lasts a while (holding an action, the
+            # Shared for one flight, then left alone. What lasts a while (holding an action, the
             # watchdog) must not jump when the simulator gives up time. The rehearsal corrects the
             # stamps afterwards.
             if request.epoch_ns is not None:
@@ -81,12 +67,7 @@ class Missions:
         self._requests.put(request)
 
     def run(self) -> None:
-        """Fly what is asked for, until it is time to end.
-
-        Raises:
-            UsageError: The policy cannot use the camera.
-            LinkError: No flight controller is heard.
-        """
+        """Fly the requested missions until the end; UsageError: the camera does not fit."""
         aircraft, clock = self._scenario.scenario, self._clock
         camera_port = aircraft.open_ports.camera_port
         use = UseMeter(WallClock())
@@ -98,8 +79,8 @@ class Missions:
             signed(f"udpin://{LOOPBACK}:{aircraft.companion_port}", aircraft.signing_key) as url,
             closing(MavsdkLink(url, clock, self._abandon)) as link,
         ):
-            self._channel.send(Ready())
-            while not isinstance(request := self._requests.get(), Shutdown):
+            self._harness.send(channel.Ready())
+            while not isinstance(request := self._requests.get(), channel.Shutdown):
                 if not link.connected:
                     link.connect(CONNECT_TIMEOUT_S)
                 policy = self._scenario.fresh_policy(request.seed)
@@ -133,8 +114,8 @@ class Missions:
                 )
                 used = use.end()
                 save_arrays(Path(request.record), result.log.columns())
-                self._channel.send(
-                    Ended(
+                self._harness.send(
+                    channel.Ended(
                         reason=result.reason,
                         notes=result.notes,
                         path=request.record,
@@ -144,10 +125,10 @@ class Missions:
                 )
 
     def _announce(self, phase: str) -> None:
-        self._channel.send(Progress(phase=phase, time_us=self._clock.time_us()))
+        self._harness.send(channel.Progress(phase=phase, time_us=self._clock.time_us()))
 
 
-def fly(begin: Begin, channel: ChildChannel) -> None:
+def fly(begin: channel.Begin, harness: channel.ChildChannel) -> None:
     """Fly missions on request, until the pipe ends."""
     with ExitStack() as held:
         tap: CompanionTap | None = None
@@ -155,12 +136,12 @@ def fly(begin: Begin, channel: ChildChannel) -> None:
             from airl_mav.view.taps import CompanionTap
 
             tap = held.enter_context(closing(CompanionTap(begin.view, begin.scenario)))
-        missions = Missions(begin.scenario, channel, tap)
+        missions = Missions(begin.scenario, harness, tap)
         # Without its rehearsal a companion has no business in the air, whatever it is doing: its
         # setpoints end and the flight controller's offboard-loss failsafe takes over.
-        channel.listen(missions.handle, lambda: os._exit(EXIT_BROKEN))
+        harness.listen(missions.handle, lambda: os._exit(EXIT_BROKEN))
         missions.run()
 
 
 if __name__ == "__main__":
-    sys.exit(serve(fly, LinkError))
+    sys.exit(channel.serve(fly, LinkError))

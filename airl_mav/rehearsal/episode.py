@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_MS, US_PER_S
@@ -19,19 +19,18 @@ from airl_mav.flight.quality import measure_quality
 from airl_mav.flight.record import EpisodeRecord, FaultActed
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.flight.validity import BY_HAND, host_faults, host_figures
-from airl_mav.latency.matching import match_setpoints, stamps_of
 from airl_mav.latency.stages import stage_durations
-from airl_mav.latency.stamps import SETPOINT, STAMPS, setpoint_column
+from airl_mav.latency.stamps import NO_STAMP, SETPOINT, STAMPS, setpoint_column
 from airl_mav.profiles.camera_kind import SLOW
 from airl_mav.rehearsal.channel import Ended, Loaded, State
-from airl_mav.rehearsal.process_faults import ProcessFaults
+from airl_mav.rehearsal.process_pair import ProcessFaults
 from airl_mav.rehearsal.run_folder import TICK_LATENESS, FlownEpisode
 from airl_mav.rehearsal.supervisor import Supervisor
 from airl_mav.scenario.resolved import ResolvedScenario
 from companion.interfaces import CAMERA_SILENT, FRAMES_LATE, LINK_LOST, TELEMETRY_FROZEN
 
 SEPARATED = (LINK_LOST, CAMERA_SILENT, TELEMETRY_FROZEN, FRAMES_LATE)
-"""Why a mission ends when both processes live but no longer hear each other: one of them stood
+"""Why a mission ends when both processes live but no longer hear each other. One of them stood
 still for seconds, or the host has too much to do."""
 
 DISTURBING = (*PROCESSES, *LINKS, "camera")
@@ -81,14 +80,7 @@ class Episode:
 def join_episode(
     episode: Episode, scenario: ResolvedScenario, record_path: Path, decisions_path: Path
 ) -> FlownEpisode:
-    """Join what both processes left of an episode.
-
-    Args:
-        episode: The episode, judged.
-        scenario: What was flown.
-        record_path: The firmware's arrays.
-        decisions_path: The companion's decision log; may be missing.
-    """
+    """Join what both processes left of a judged episode; the companion's log may be missing."""
     arrays = _read(record_path)
     trajectory = Trajectory.from_arrays(part_of(arrays, "trajectory"))
     latency = part_of(arrays, "estimate", keep_prefix=True)
@@ -188,17 +180,10 @@ def judged_record(
     started_us: int,
     **known: Any,
 ) -> EpisodeRecord:
-    """Return the record of a flight that a referee has watched.
+    """Return the record of a flight that a referee has watched; one without a verdict is aborted.
 
-    Args:
-        scenario: What was flown.
-        referee: Who judged; a flight without a verdict is aborted.
-        trajectory: The true path.
-        latency: The columns of its decisions.
-        navigation_us: When navigation began, by the clock of the trajectory [µs]; None: never.
-        seed: Of the episode.
-        started_us: When it began, by the same clock [µs].
-        known: The fields of `EpisodeRecord` that neither scenario nor referee tells.
+    Navigation began, and the episode started, by the clock of the trajectory [µs]. `known` are the
+    fields of `EpisodeRecord` that neither scenario nor referee tells.
     """
     verdict = referee.verdict or referee.abort(started_us, "no verdict")
     quality = None
@@ -260,10 +245,7 @@ def join_stamps(
 ) -> dict[str, NDArray[Any]]:
     """Return the decision log with the times at which the autopilot accepted and applied each.
 
-    Args:
-        decisions: The companion's log, by column.
-        setpoints: The firmware's log, by column; empty where nobody can look into it.
-        slips: (k, 2) times at which simulated time was given up, and how much [µs].
+    Slips (k, 2) are the times at which simulated time was given up, and how much [µs].
     """
     by_simulator = {name: without_slips(decisions[name], slips) for name in COMPANION_STAMPS}
     if not setpoints:
@@ -286,7 +268,7 @@ def without_slips(times_us: NDArray[np.int64], slips: NDArray[np.int64]) -> NDAr
     """Return times (n,) of a clock that ran on as the simulator's clock tells them [µs].
 
     Both agreed at the start of the episode. Each slip set the simulator's clock back to the tick
-    that was due: what happened while it stood still happened at that tick.
+    that was due. What happened while it stood still happened at that tick.
     """
     told = times_us.copy()
     given_up_us = 0
@@ -307,3 +289,56 @@ def part_of(
     """Return the arrays whose names begin with `prefix/`, by the rest of their names."""
     cut = 0 if keep_prefix else len(prefix) + 1
     return {k[cut:]: v for k, v in arrays.items() if k.startswith(f"{prefix}/")}
+
+
+UNMATCHED = -1
+
+SAME_WITHIN = 1e-5
+"""Setpoints closer than this in every element [m/s, rad, rad/s] are the same: MAVSDK turns degrees
+into radians in float32, which costs the last bits of a yaw."""
+
+
+def match_setpoints(
+    sent_us: ArrayLike,
+    sent_values: ArrayLike,
+    accepted_us: ArrayLike,
+    accepted_values: ArrayLike,
+) -> NDArray[np.int64]:
+    """Match each sent setpoint (n, 4) with the first accepted copy of it.
+
+    MAVSDK sends a setpoint at once, and again at 20 Hz until the next one. A copy counts when it
+    was accepted at or after the sending, before the next one was sent, and carries the same four
+    numbers (NaN, an unused field, equals NaN). When a decision repeats the one before, a resend of
+    that one still under way counts as well. It commands the same. Return the index (n,) into the
+    accepted ones, `UNMATCHED` where there is none.
+    """
+    sent = np.asarray(sent_us, np.int64)
+    accepted = np.asarray(accepted_us, np.int64)
+    sent_rows = np.asarray(sent_values, np.float32).reshape(-1, 4)
+    accepted_rows = np.asarray(accepted_values, np.float32).reshape(-1, 4)
+    if len(sent) != len(sent_rows) or len(accepted) != len(accepted_rows):
+        raise ValueError(
+            f"{len(sent)} sending times for {len(sent_rows)} setpoints, "
+            f"{len(accepted)} acceptance times for {len(accepted_rows)}"
+        )
+    if np.any(np.diff(sent) < 0) or np.any(np.diff(accepted) < 0):
+        raise ValueError("times go back: sent_us and accepted_us must be in order")
+    index = np.full(len(sent), UNMATCHED, np.int64)
+    first = np.searchsorted(accepted, sent, side="left")
+    end = np.append(np.searchsorted(accepted, sent[1:], side="left"), len(accepted))
+    for i, (start, stop) in enumerate(zip(first, end, strict=False)):
+        window = accepted_rows[start:stop]
+        same = np.isclose(window, sent_rows[i], rtol=0.0, atol=SAME_WITHIN, equal_nan=True)
+        hits = np.flatnonzero(same.all(axis=1))
+        if hits.size:
+            index[i] = start + hits[0]
+    return index
+
+
+def stamps_of(index: ArrayLike, times_us: ArrayLike) -> NDArray[np.int64]:
+    """Look up the time (n,) [µs] of each match in `times_us` (m,); `NO_STAMP` where unmatched."""
+    where = np.asarray(index, np.int64)
+    stamps = np.full(len(where), NO_STAMP, np.int64)
+    matched = where != UNMATCHED
+    stamps[matched] = np.asarray(times_us, np.int64)[where[matched]]
+    return stamps

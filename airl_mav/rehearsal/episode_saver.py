@@ -1,6 +1,6 @@
 """Saves episodes in batches, in a thread of its own.
 
-Episodes of the levels gym and lockstep end faster than single ones can be saved, and who flies or
+Episodes of the levels gym and lockstep end faster than single ones can be saved. Who flies or
 hands out flights must not wait for the disk. The files and what they promise are those of
 `RunFolder.save_episodes`.
 """
@@ -8,7 +8,6 @@ hands out flights must not wait for the disk. The files and what they promise ar
 from __future__ import annotations
 
 import threading
-from types import TracebackType
 
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
@@ -19,7 +18,7 @@ INTERVAL_S = 2.0
 
 INTERVAL_PER_SAVE = 9.0
 """Least time between two saves, in multiples of how long the last one took. Adding to an archive
-copies it: without this, saving would take most of the time of a run of ten thousand flights."""
+copies it. Without this, saving would take most of the time of a run of ten thousand flights."""
 
 MAX_WAITING = 1000
 """Most episodes that wait to be saved."""
@@ -41,12 +40,7 @@ class EpisodeSaver:
         self._thread.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         """Save the rest. Raises the error of a save that failed, unless one is under way."""
         with self._changed:
             self._ending = True

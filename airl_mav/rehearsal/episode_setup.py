@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from airl_mav.arena.geometry import Arena
-from airl_mav.core.frames import Geodetic
+from airl_mav.core.frames import Geodetic, quat_yaw
+from airl_mav.rehearsal.channel import State
 from airl_mav.scenario.resolved import ResolvedScenario
+from firmware_sim.autopilot.commander import Phase
 from firmware_sim.hover_start import HoverStart
-from firmware_sim.simulation import EpisodeSetup
+from firmware_sim.simulation import EpisodeSetup, Simulation
 
 
 def episode_setup(resolved: ResolvedScenario, arena: Arena, seed: int) -> EpisodeSetup:
-    """Return the setup of an episode.
-
-    Args:
-        resolved: The scenario.
-        arena: Arena of the seed.
-        seed: Seed of sensors, wind and the aircraft's tolerances.
-    """
+    """Return the setup of an episode in the arena of a seed."""
     hover = None
     if resolved.scenario.start == "hover":
         place = None if resolved.vehicle.uses_gps else resolved.companion_pilot.origin
@@ -29,4 +27,22 @@ def episode_setup(resolved: ResolvedScenario, arena: Arena, seed: int) -> Episod
         resolved.scenario,
         resolved.computer.onboard_watts,
         hover,
+    )
+
+
+def state_of(simulation: Simulation, collision: str | None, slipped_us: int = 0) -> State:
+    """Return the state after the newest tick, with what has been hit and slipped so far."""
+    truth, flight = simulation.truth, simulation.autopilot.flight
+    x, y, z = (float(c) for c in truth.position)
+    return State(
+        time_us=truth.time_us,
+        position=(x, y, z),
+        speed_m_s=float(np.linalg.norm(truth.velocity)),
+        yaw=quat_yaw(truth.quaternion),
+        battery=truth.battery_remaining,
+        collision=collision,
+        mode=flight.mode.name.lower(),
+        armed=flight.phase >= Phase.GROUND,
+        landed=flight.phase < Phase.AIR,
+        slipped_us=slipped_us,
     )

@@ -1,7 +1,4 @@
-"""The firmware process of a rehearsal: plant, flight controller and camera, episodes on request.
-
-Its standard input brings the resolved scenario in one line, then requests; see `rehearsal.channel`.
-"""
+"""The firmware process of a rehearsal: plant, flight controller and camera, episodes on request."""
 
 from __future__ import annotations
 
@@ -22,23 +19,8 @@ from airl_mav.core.signing_key import StoredSigning
 from airl_mav.faults.kinds import PROCESSES
 from airl_mav.faults.model import Fault, link_fails
 from airl_mav.profiles.vehicle import VehicleProfile
-from airl_mav.rehearsal.channel import (
-    Begin,
-    ChildChannel,
-    Compiling,
-    Due,
-    FinishEpisode,
-    Loaded,
-    LoadEpisode,
-    LogLost,
-    Ready,
-    Saved,
-    Shutdown,
-    Text,
-    serve,
-)
-from airl_mav.rehearsal.episode_setup import episode_setup
-from airl_mav.rehearsal.true_state import state_of
+from airl_mav.rehearsal import channel
+from airl_mav.rehearsal.episode_setup import episode_setup, state_of
 from airl_mav.scenario.aircraft import Aircraft
 from airl_mav.scenario.resolved import ResolvedScenario
 from firmware_sim.autopilot.autopilot_state import Message
@@ -79,22 +61,12 @@ def build_firmware(
 ) -> Firmware:
     """Bind all ports and return the firmware without an episode.
 
-    Args:
-        aircraft: What was asked of it.
-        vehicle: What it flies.
-        pacing: How simulated time passes.
-        bind: IPv4 address that links and camera bind.
-        companion_host: IPv4 address of the companion computer.
-        gcs_host: IPv4 address of the ground station.
-        insecure: Whether addresses are allowed that other machines can reach.
-        log: What real firmware prints goes here; None: to a file in its folder.
-        parameters_file: Where the built-in autopilot keeps the parameters that users set; None: it
-            forgets them.
-        recording: Whether episodes are recorded, to be saved; without, they may last for ever.
-        bind_devices: Binds more links of the built-in flight controller, after the others.
+    Addresses are IPv4; `insecure` allows those that other machines can reach. What real firmware
+    prints goes to `log`, or into a file in its folder. The built-in autopilot keeps the parameters
+    that users set in `parameters_file`, or forgets them. Without `recording` episodes may last for
+    ever. `bind_devices` binds more links of the built-in flight controller, after the others.
 
-    Raises:
-        UsageError: A port is taken, an address unusable, or real firmware is not there.
+    Raises UsageError if a port is taken, an address unusable, or real firmware is not there.
     """
     ports = aircraft.open_ports
 
@@ -143,7 +115,7 @@ class Service:
     def __init__(
         self,
         firmware: Firmware,
-        channel: ChildChannel,
+        harness: channel.ChildChannel,
         scenario: ResolvedScenario,
         tap: SimulationTap | None = None,
     ) -> None:
@@ -152,27 +124,22 @@ class Service:
         if tap is not None:
             firmware.on_frame = tap.frame
         self._firmware = firmware
-        self._channel = channel
+        self._harness = harness
         self._scenario = scenario
         firmware.on_tick, firmware.on_message = self._report, self._tell
-        firmware.on_log_lost = lambda what: channel.send(LogLost(what=what))
+        firmware.on_log_lost = lambda what: harness.send(channel.LogLost(what=what))
         self._record = Path()
         self._reported = 0
         self._crash = CrashDetector()
         self._due: dict[int, Fault] = {}
         """The faults of processes that the rehearsal was told to carry out, by their number."""
         self._handlers: dict[type, Callable[[Any], None]] = {
-            LoadEpisode: self._load,
-            FinishEpisode: self._finish,
+            channel.LoadEpisode: self._load,
+            channel.FinishEpisode: self._finish,
         }
 
     def run(self, requests: queue.Queue[Any]) -> None:
-        """Fly until it is time to end.
-
-        Raises:
-            UsageError: An episode cannot be made.
-            FirmwareLostError: Real firmware is gone.
-        """
+        """Fly until the end; UsageError if an episode cannot be made, or FirmwareLostError."""
         while self._handle_all(requests):
             self._firmware.step()
 
@@ -181,12 +148,12 @@ class Service:
         with contextlib.suppress(queue.Empty):
             while True:
                 request = requests.get(block=False)
-                if isinstance(request, Shutdown):
+                if isinstance(request, channel.Shutdown):
                     return False
                 self._handlers[type(request)](request)
         return True
 
-    def _load(self, request: LoadEpisode) -> None:
+    def _load(self, request: channel.LoadEpisode) -> None:
         scenario = self._scenario
         arena = scenario.arena_of(request.seed)
         episode = episode_setup(scenario, arena, request.seed)
@@ -197,8 +164,8 @@ class Service:
         if self._tap is not None:
             self._tap.begin(request.seed, arena, loaded.time_us)
         self._record = Path(request.record)
-        self._channel.send(
-            Loaded(
+        self._harness.send(
+            channel.Loaded(
                 episode=request.episode,
                 time_us=loaded.time_us,
                 epoch_ns=loaded.epoch_ns,
@@ -207,10 +174,10 @@ class Service:
             )
         )
 
-    def _finish(self, _: FinishEpisode) -> None:
+    def _finish(self, _: channel.FinishEpisode) -> None:
         self._firmware.save(self._record)
         self._firmware.discard()
-        self._channel.send(Saved(path=str(self._record)))
+        self._harness.send(channel.Saved(path=str(self._record)))
 
     def _report(self, simulation: Simulation) -> None:
         if simulation.faults is not None:
@@ -222,7 +189,7 @@ class Service:
         if not hit and period == self._reported:
             return
         self._reported = period
-        self._channel.send(state_of(simulation, self._crash.hit, self._firmware.slipped_us))
+        self._harness.send(state_of(simulation, self._crash.hit, self._firmware.slipped_us))
 
     def _tell_faults(self, timeline: FaultTimeline, now_us: int) -> None:
         """Tell the faults of processes that begin or end."""
@@ -234,13 +201,15 @@ class Service:
             if begins and (fault.part, fault.kind) == ("firmware", "killed"):
                 # What is true is known until then; nobody could ask for it afterwards.
                 self._firmware.save(self._record)
-            self._channel.send(Due(time_us=now_us, fault=str(fault), begins=begins))
+            self._harness.send(channel.Due(time_us=now_us, fault=str(fault), begins=begins))
         self._due = acting
 
     def _tell(self, message: Message) -> None:
         simulation = self._firmware.simulation
         time_us = 0 if simulation is None else simulation.time_us
-        self._channel.send(Text(time_us=time_us, severity=int(message.severity), text=message.text))
+        self._harness.send(
+            channel.Text(time_us=time_us, severity=int(message.severity), text=message.text)
+        )
 
 
 def unix_us() -> int:
@@ -248,10 +217,10 @@ def unix_us() -> int:
     return int(utc_now().timestamp() * US_PER_S)
 
 
-def fly(begin: Begin, channel: ChildChannel) -> None:
+def fly(begin: channel.Begin, harness: channel.ChildChannel) -> None:
     """Fly episodes on request, until the pipe ends."""
     requests: queue.Queue[Any] = queue.Queue()
-    channel.listen(requests.put, lambda: requests.put(Shutdown()))
+    harness.listen(requests.put, lambda: requests.put(channel.Shutdown()))
     scenario = begin.scenario
     firmware = build_firmware(
         scenario.scenario,
@@ -266,11 +235,11 @@ def fly(begin: Begin, channel: ChildChannel) -> None:
             from airl_mav.view.taps import SimulationTap
 
             tap = held.enter_context(closing(SimulationTap(begin.view, scenario)))
-        with heard_compiling(lambda begins: channel.send(Compiling(begins=begins))):
+        with heard_compiling(lambda begins: harness.send(channel.Compiling(begins=begins))):
             warm_up(scenario.vehicle, scenario.scenario.plant)
-        channel.send(Ready())
-        Service(firmware, channel, scenario, tap).run(requests)
+        harness.send(channel.Ready())
+        Service(firmware, harness, scenario, tap).run(requests)
 
 
 if __name__ == "__main__":
-    sys.exit(serve(fly, FirmwareLostError))
+    sys.exit(channel.serve(fly, FirmwareLostError))

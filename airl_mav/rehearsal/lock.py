@@ -23,18 +23,8 @@ POLL_S = 0.05
 def locked(path: Path, say: Callable[[str], None]) -> Iterator[int]:
     """Keep a folder, made when there is none, to this process and those that inherit the lock.
 
-    The lock ends with the last process that has the descriptor, however that ends: the processes of
-    a run that was killed are waited for, as they hold its ports and may still write.
-
-    Args:
-        path: The folder.
-        say: Called with a message when another process holds the lock.
-
-    Yields:
-        A descriptor to be passed to child processes.
-
-    Raises:
-        UsageError: Another run has the folder, or it cannot be made.
+    The lock ends with the last process that has the yielded descriptor. The processes of a killed
+    run are waited for. They hold its ports and may still write.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)

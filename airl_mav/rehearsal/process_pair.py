@@ -1,4 +1,4 @@
-"""Firmware and companion as one: started, listened to and ended together."""
+"""Firmware and companion as one: started, listened to, made to fail and ended together."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ from airl_mav.core.child_process import GRACE_S, ChildProcess, Exited
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
-from airl_mav.rehearsal.channel import Begin, Compiling, Event, Failed, Ready, parse_event
+from airl_mav.faults.model import Fault
+from airl_mav.rehearsal.channel import Begin, Compiling, Due, Event, Failed, Ready, parse_event
 
 FIRMWARE, COMPANION = "firmware", "companion"
 
@@ -39,10 +40,7 @@ LOOK_S = 0.2
 
 
 class LostError(Exception):
-    """A process died or hangs, or they lost each other: the flight is no test of anything.
-
-    The message says all that is known; `what` is one line for the records.
-    """
+    """A process died or hangs, or they lost each other; `what` is one line for the records."""
 
     def __init__(self, what: str, detail: str = "") -> None:
         super().__init__(what + detail)
@@ -62,16 +60,7 @@ class Child(ChildProcess):
         keeps: Sequence[int] = (),
         environment: Mapping[str, str] | None = None,
     ) -> None:
-        """Start `python -m module`.
-
-        Args:
-            name: What it is called in messages and in the queue.
-            module: Python module with a `__main__` guard.
-            log: Its standard error goes here.
-            events: Gets (name, event); after the last one (name, Exited).
-            keeps: File descriptors that it inherits and never uses: locks.
-            environment: Added to our own environment.
-        """
+        """Start `python -m module`; `events` gets (name, event), and (name, Exited) in the end."""
         super().__init__(
             [sys.executable, "-m", module],
             log,
@@ -131,18 +120,7 @@ class ProcessPair:
     def start(
         self, begin: Begin, logs: Path, keeps: Sequence[int], compiling: Callable[[], None]
     ) -> None:
-        """Start both processes and wait until they are ready.
-
-        Args:
-            begin: What both are told first.
-            logs: Folder that their standard error goes to.
-            keeps: File descriptors that they inherit: locks.
-            compiling: Called when one compiles kernels first.
-
-        Raises:
-            UsageError: A process says that its input cannot be used.
-            LostError: A process died or did not become ready in time.
-        """
+        """Start both processes and wait until they are ready, or raise UsageError or LostError."""
         self._scratch = tempfile.mkdtemp(prefix="airl-companion-")
         places = {COMPANION: {"TMPDIR": self._scratch}}
         for name, module in MODULES.items():
@@ -189,13 +167,7 @@ class ProcessPair:
         return not self._children[name].ending
 
     def suspend(self, name: str, for_s: float | None = None) -> None:
-        """Suspend a process, as a computer that hangs.
-
-        Args:
-            name: Which one.
-            for_s: It is resumed after so long, while events are waited for [wall s]; None: on
-                request.
-        """
+        """Suspend a process, as a computer that hangs, for some wall time or until `resume`."""
         now_us = self._clock.time_us()
         until_us = None if for_s is None else now_us + round(for_s * US_PER_S)
         self._children[name].suspend()
@@ -249,17 +221,10 @@ class ProcessPair:
         what: str,
         paused: Callable[[], bool] = lambda: False,
     ) -> None:
-        """Feed events to `take` until it returns True.
+        """Feed events, with the name of their process, to `take` until it returns True.
 
-        Args:
-            take: Gets the name of a process and what it says.
-            timeout_s: Longest wait [wall s].
-            what: What is waited for, in words.
-            paused: Whether the time does not count at present: a process compiles kernels.
-
-        Raises:
-            UsageError: A process says that its input cannot be used.
-            LostError: A process died or failed, or the time is over.
+        While `paused`, time does not count. Raises UsageError if a process says so, and LostError
+        if one died or failed, or the time [wall s] is over; `what` is waited for, in words.
         """
         since = WallClock()
         paused_us = before_us = 0
@@ -308,3 +273,57 @@ class ProcessPair:
         raise LostError(
             f"the {name} died ({exited})", f"; log: {child.log}" + (f"\n{tail}" if tail else "")
         )
+
+
+KILLED = "killed"
+
+
+class ProcessFaults:
+    """Carries out what is due."""
+
+    def __init__(self, pair: ProcessPair, speed: float) -> None:
+        """Take the processes, and simulated seconds per wall second."""
+        self._pair = pair
+        self._speed = speed
+        self._suspended_before_us = pair.suspended_us(FIRMWARE)
+        self._out: dict[str, str] = {}
+
+    def out(self, name: str) -> str | None:
+        """Return what became of a process that flies no more in this episode, as "killed"."""
+        return self._out.get(name)
+
+    @property
+    def reason(self) -> str | None:
+        """Why a flight ends that one of them flies no more, in words; None: both fly."""
+        return "; ".join(f"{name} {kind}" for name, kind in self._out.items()) or None
+
+    @property
+    def paused_us(self) -> int:
+        """How long the firmware was suspended, as asked for [simulated µs]."""
+        return round((self._pair.suspended_us(FIRMWARE) - self._suspended_before_us) * self._speed)
+
+    def carry_out(self, due: Due) -> str | None:
+        """Begin or end a fault; return what was done, for the records, or None."""
+        fault = Fault.model_validate(due.fault)
+        name, kind, at_s = fault.part, fault.kind, due.time_us / US_PER_S
+        if name in self._out:
+            return None
+        if not due.begins:
+            # The firmware, which is suspended itself, is timed by the wall clock.
+            if name == COMPANION:
+                self._pair.resume(name)
+                return f"{name} resumed at {at_s:.2f} s"
+            return None
+        if fault.for_good:
+            self._out[name] = kind
+        if kind == KILLED:
+            self._pair.kill(name)
+        else:
+            for_s = fault.for_s if name == FIRMWARE else None
+            self._pair.suspend(name, None if for_s is None else for_s / self._speed)
+        return f"{name} {kind} at {at_s:.2f} s, as asked for"
+
+    def undo(self) -> None:
+        """Let those go on that still stand."""
+        for name in (FIRMWARE, COMPANION):
+            self._pair.resume(name)

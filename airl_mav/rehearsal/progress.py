@@ -25,10 +25,7 @@ OUTCOME_STYLES = {
 
 
 class Observer:
-    """Looks on while episodes are flown; by itself it passes everything over.
-
-    All calls come from one thread, or while it waits.
-    """
+    """Looks on while episodes are flown, from one thread at a time; by itself it does nothing."""
 
     def waiting(self, what: str) -> None:
         """Something is being waited for."""

@@ -1,7 +1,7 @@
 """A rehearsal: two processes, N seeded episodes, one run folder, whatever happens to the processes.
 
 An episode is saved when it has been flown whole. One that lost a process on the way is flown again
-by two new ones, from its seed, and so is one that the host disturbed: nothing of them enters the
+by two new ones, from its seed. So is one that the host disturbed. Nothing of them enters the
 records but a note. What is still invalid after the last attempt is saved as such.
 """
 
@@ -15,29 +15,15 @@ from airl_mav.core.compiling import COMPILING
 from airl_mav.core.constants import MAX_ATTEMPTS, US_PER_S
 from airl_mav.flight.judge import Referee, TruthSample, Verdict
 from airl_mav.flight.validity import BY_HAND
-from airl_mav.rehearsal.channel import (
-    Abort,
-    Begin,
-    Due,
-    Ended,
-    Event,
-    FinishEpisode,
-    Fly,
-    Loaded,
-    LoadEpisode,
-    LogLost,
-    Progress,
-    Saved,
-    State,
-    Text,
-)
+from airl_mav.rehearsal import channel
 from airl_mav.rehearsal.episode import Episode, disturbances, disturbing, join_episode
-from airl_mav.rehearsal.process_faults import KILLED, ProcessFaults
 from airl_mav.rehearsal.process_pair import (
     COMPANION,
     FIRMWARE,
+    KILLED,
     REPLY_TIMEOUT_S,
     LostError,
+    ProcessFaults,
     ProcessPair,
 )
 from airl_mav.rehearsal.progress import WARNING, Observer
@@ -68,15 +54,7 @@ class Rehearsal:
         keeps: Sequence[int] = (),
         view: ViewEnds | None = None,
     ) -> None:
-        """Take the scenario; nothing is started yet.
-
-        Args:
-            scenario: What is flown.
-            folder: Where everything goes.
-            observer: Who looks on.
-            keeps: File descriptors that the processes inherit: locks.
-            view: Where the flights are watched; None: nowhere.
-        """
+        """Take the scenario; nothing is started yet. The processes inherit the locks in `keeps`."""
         self._view = view
         self._scenario = scenario
         self._speed = scenario.speed or 1.0
@@ -94,15 +72,7 @@ class Rehearsal:
         self._dismiss()
 
     def run(self, done: Collection[int] = ()) -> None:
-        """Fly the episodes; each is saved as it ends.
-
-        Args:
-            done: Numbers of those that need not be flown.
-
-        Raises:
-            UsageError: A process says that its input cannot be used.
-            RehearsalError: An episode was lost too often.
-        """
+        """Fly the episodes that are not `done` and save each; RehearsalError: lost too often."""
         for index, seed in enumerate(self._scenario.scenario.seeds):
             if index not in done:
                 self._fly_surely(index, seed)
@@ -142,7 +112,7 @@ class Rehearsal:
             self._pair = pair = ProcessPair()
             self._observer.waiting("starting firmware and companion")
             log = (self._folder.path / FIRMWARE_PRINTS).absolute()
-            begin = Begin(scenario=self._scenario, log=str(log), view=self._view)
+            begin = channel.Begin(scenario=self._scenario, log=str(log), view=self._view)
             pair.start(
                 begin, self._folder.path, self._keeps, lambda: self._observer.waiting(COMPILING)
             )
@@ -172,7 +142,7 @@ class Rehearsal:
         self._clear(index)
         pair.send(
             FIRMWARE,
-            LoadEpisode(
+            channel.LoadEpisode(
                 episode=index,
                 seed=seed,
                 tlog=str(folder.tlog_path(index).absolute()),
@@ -181,7 +151,9 @@ class Rehearsal:
         )
         known = list(notes)
         loaded = pair.wait_for(
-            Loaded, lambda event: self._look(event, known), load_timeout_s(scenario.scenario)
+            channel.Loaded,
+            lambda event: self._look(event, known),
+            load_timeout_s(scenario.scenario),
         )
         supervisor = Supervisor(Referee(scenario.task(loaded.goal)), loaded.time_us)
         faults = ProcessFaults(pair, self._speed)
@@ -189,7 +161,7 @@ class Rehearsal:
         self._observer.episode(index, seed, loaded.goal)
         pair.send(
             COMPANION,
-            Fly(
+            channel.Fly(
                 episode=index,
                 goal=loaded.goal,
                 epoch_ns=loaded.epoch_ns,
@@ -217,8 +189,8 @@ class Rehearsal:
             raise LostError(f"{SEPARATED_BY} ({reason})")
         self._observer.waiting("saving the flight")
         if pair.lives(FIRMWARE):
-            pair.send(FIRMWARE, FinishEpisode())
-            pair.wait_for(Saved, lambda event: self._look(event, episode.notes))
+            pair.send(FIRMWARE, channel.FinishEpisode())
+            pair.wait_for(channel.Saved, lambda event: self._look(event, episode.notes))
         flown = join_episode(episode, scenario, record_path, decisions_path)
         if not (pair.lives(FIRMWARE) and pair.lives(COMPANION)):
             self._dismiss()
@@ -237,7 +209,7 @@ class Rehearsal:
         """Let those go on that still stand; a companion that flies no more says what it knows."""
         episode.faults.undo()
         if episode.ended is None and pair.lives(COMPANION):
-            pair.send(COMPANION, Abort(land=False))
+            pair.send(COMPANION, channel.Abort(land=False))
             try:
                 pair.pump(
                     lambda _, event: self._follow(pair, episode, event), REPLY_TIMEOUT_S, "its end"
@@ -246,25 +218,25 @@ class Rehearsal:
                 # It was not to fly any more anyway: what it knows of its decisions is lost.
                 pair.stop_one(COMPANION)
 
-    def _follow(self, pair: ProcessPair, episode: Episode, event: Event) -> bool:
+    def _follow(self, pair: ProcessPair, episode: Episode, event: channel.Event) -> bool:
         """Take one event of a flight; True when the companion has ended it."""
         referee = episode.referee
-        if isinstance(event, State):
+        if isinstance(event, channel.State):
             self._see(pair, episode, event)
-        elif isinstance(event, LogLost):
+        elif isinstance(event, channel.LogLost):
             episode.notes.append(event.what)
-        elif isinstance(event, Due):
+        elif isinstance(event, channel.Due):
             self._carry_out(episode, event)
-        elif isinstance(event, Progress):
+        elif isinstance(event, channel.Progress):
             self._observer.phase(event.phase, event.time_us)
             if event.phase == "navigating":
                 episode.navigating_us = event.time_us
                 referee.start_navigation(event.time_us - episode.slipped_us)
-        elif isinstance(event, Text):
+        elif isinstance(event, channel.Text):
             self._observer.text(event)
             if episode.faults.out(COMPANION) and event.severity <= WARNING:
                 episode.notes.append(_said(event))
-        elif isinstance(event, Ended):
+        elif isinstance(event, channel.Ended):
             episode.ended = event
             episode.notes.extend(event.notes)
             self._end(episode, episode.faults.reason or event.reason)
@@ -277,7 +249,7 @@ class Rehearsal:
             now_us = episode.state.time_us if episode.state else episode.loaded.time_us
             self._judge(episode, episode.referee.abort(now_us, reason))
 
-    def _carry_out(self, episode: Episode, due: Due) -> None:
+    def _carry_out(self, episode: Episode, due: channel.Due) -> None:
         """Stop a process, kill it, or let it go on, as asked for."""
         faults = episode.faults
         if (done := faults.carry_out(due)) is not None:
@@ -294,7 +266,7 @@ class Rehearsal:
             self._end(episode, faults.reason)
         return episode.referee.verdict is not None
 
-    def _see(self, pair: ProcessPair, episode: Episode, state: State) -> None:
+    def _see(self, pair: ProcessPair, episode: Episode, state: channel.State) -> None:
         episode.state = state
         self._observer.state(state, episode.loaded.time_us)
         judged = episode.referee.verdict is not None
@@ -305,7 +277,7 @@ class Rehearsal:
         if verdict is not None and not judged:
             self._judge(episode, verdict)
         if order is not None:
-            pair.send(COMPANION, Abort(land=order is Order.LAND))
+            pair.send(COMPANION, channel.Abort(land=order is Order.LAND))
 
     def _judge(self, episode: Episode, verdict: Verdict) -> None:
         if episode.wall_us is None:
@@ -315,19 +287,15 @@ class Rehearsal:
         self._observer.phase(verdict.outcome.value, verdict.time_us)
 
     def _watch_failsafe(self, pair: ProcessPair, episode: Episode) -> list[str]:
-        """The companion is gone: watch what the flight controller does, until it is down.
-
-        Returns:
-            What the autopilot said.
-        """
+        """Watch the flight controller without its companion until it is down; return its texts."""
         self._observer.waiting("companion lost: watching the failsafe land the vehicle")
         said: list[str] = []
 
-        def down(_name: str, event: Event) -> bool:
-            if isinstance(event, Text):
+        def down(_name: str, event: channel.Event) -> bool:
+            if isinstance(event, channel.Text):
                 self._observer.text(event)
                 said.append(_said(event))
-            if isinstance(event, State):
+            if isinstance(event, channel.State):
                 self._observer.state(event, episode.loaded.time_us)
                 return not event.armed
             return False
@@ -338,13 +306,13 @@ class Rehearsal:
             said.append(error.what)
         return said
 
-    def _look(self, event: Event, notes: list[str]) -> None:
+    def _look(self, event: channel.Event, notes: list[str]) -> None:
         """Take an event that nobody waits for; what is to be recorded of it is added to `notes`."""
-        if isinstance(event, Text):
+        if isinstance(event, channel.Text):
             self._observer.text(event)
-        elif isinstance(event, LogLost):
+        elif isinstance(event, channel.LogLost):
             notes.append(event.what)
 
 
-def _said(text: Text) -> str:
+def _said(text: channel.Text) -> str:
     return f"autopilot at {text.time_us / US_PER_S:.2f} s: {text.text}"

@@ -1,7 +1,7 @@
-"""The folder of a run: a new one, or one that is gone on with; a kill loses no saved episode.
+"""The folder of a run: a new one, or one that is gone on with. A kill loses no saved episode.
 
 docs/run-folder.md describes every file. An episode is committed by its line in `episodes.jsonl`,
-which is written last; arrays without a line belong to an episode that never ended.
+which is written last. Arrays without a line belong to an episode that never ended.
 """
 
 from __future__ import annotations
@@ -16,27 +16,13 @@ from typing import TYPE_CHECKING, Any
 from numpy.typing import NDArray
 from pydantic import TypeAdapter
 
+from airl_mav.core import files
 from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import UsageError
-from airl_mav.core.files import (
-    CRC,
-    NO_ARRAYS,
-    Arrays,
-    add_arrays,
-    append_lines,
-    cut_torn_line,
-    read_groups,
-    read_lines,
-    read_typed,
-    replace_file,
-    typed,
-    write_json,
-)
 from airl_mav.core.log_file import PARTIAL_SUFFIX
 from airl_mav.core.provenance import describe_machine, git_state, package_versions
 from airl_mav.flight.record import SCHEMA as LINE_SCHEMA
-from airl_mav.flight.record import EpisodeRecord
-from airl_mav.flight.setup import Setup
+from airl_mav.flight.record import EpisodeRecord, Setup
 from airl_mav.flight.trajectory import Trajectory
 from airl_mav.scenario.file import SCENARIO_FILE, save_scenario
 from airl_mav.scenario.model import free_fields
@@ -104,7 +90,7 @@ class LoadedRun:
     path: Path
     info: RunInfo
     episodes: tuple[EpisodeRecord, ...]
-    latency: dict[int, Arrays]
+    latency: dict[int, files.Arrays]
     trajectories: dict[int, Trajectory]
 
 
@@ -136,18 +122,7 @@ class RunFolder:
         setup: Setup,
         seeds: Sequence[int] = (),
     ) -> RunFolder:
-        """Make the folder and write `run.json`.
-
-        Args:
-            out: The folder; None makes `runs/<UTC time>-<name>` in the working directory.
-            name: Name of the run.
-            config: Every setting: plain values, paths, pydantic models, dataclasses.
-            setup: What is flown on what.
-            seeds: Seed of each episode planned.
-
-        Raises:
-            UsageError: `out` already holds a run, or is a file.
-        """
+        """Make the folder, by default `runs/<UTC time>-<name>`, and write `run.json`."""
         now = utc_now()
         if out is None:
             path = _fresh_folder(Path("runs"), f"{now:%Y%m%dT%H%M%SZ}-{name}")
@@ -174,11 +149,7 @@ class RunFolder:
 
     @classmethod
     def adopt(cls, path: Path, info: RunInfo) -> RunFolder:
-        """Make the folder of a run that was flown elsewhere.
-
-        Raises:
-            UsageError: It cannot be made.
-        """
+        """Make the folder of a run that was flown elsewhere, or raise UsageError."""
         try:
             path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -190,7 +161,7 @@ class RunFolder:
     def resume(cls, path: Path) -> tuple[RunFolder, LoadedRun]:
         """Open a run that was killed, cut off a half-written line, and say what is there."""
         run = load(path)
-        cut_torn_line(path / EPISODES_FILE)
+        files.cut_torn_line(path / EPISODES_FILE)
         return cls(path), run
 
     def plan_again(self, config: Mapping[str, Any], seeds: Sequence[int]) -> None:
@@ -210,13 +181,10 @@ class RunFolder:
             for line in path.read_bytes().splitlines(keepends=True)
             if json.loads(line)["index"] not in indices
         ]
-        replace_file(path, b"".join(kept))
+        files.replace_file(path, b"".join(kept))
 
     def sweep(self) -> None:
-        """Remove what processes left behind for an episode that was never finished.
-
-        The logs of a killed firmware are kept: whole records, up to its last second.
-        """
+        """Remove what an unfinished episode's processes left, but the logs of a killed firmware."""
         for pattern in (".*.npz*", f"{LATENCY_FILE}.partial", f"{TRAJECTORIES_FILE}.partial"):
             for leftover in self.path.glob(pattern):
                 leftover.unlink()
@@ -231,20 +199,17 @@ class RunFolder:
             self.path.rmdir()
 
     def save_episodes(self, episodes: Sequence[FlownEpisode]) -> None:
-        """Save episodes; on return they are on the disk.
-
-        The arrays come first, then the lines that commit them, each with the CRC of its arrays.
-        """
+        """Save episodes: the arrays, then the lines with their CRC, which commit them."""
         groups = {f"{episode.record.index:03d}": episode for episode in episodes}
         paths = {group: episode.trajectory.arrays() for group, episode in groups.items()}
         stamps = {group: episode.latency for group, episode in groups.items()}
-        path_crcs = add_arrays(self.path / TRAJECTORIES_FILE, paths)
-        stamp_crcs = add_arrays(self.path / LATENCY_FILE, stamps)
+        path_crcs = files.add_arrays(self.path / TRAJECTORIES_FILE, paths)
+        stamp_crcs = files.add_arrays(self.path / LATENCY_FILE, stamps)
         lines = [
             {**episode.record.as_data(), PATH_CRC: path_crcs[group], STAMPS_CRC: stamp_crcs[group]}
             for group, episode in groups.items()
         ]
-        append_lines(self.path / EPISODES_FILE, lines)
+        files.append_lines(self.path / EPISODES_FILE, lines)
 
 
 def check_folder(path: Path, wanted: str) -> None:
@@ -262,18 +227,8 @@ def open_folder(
     """Open the folder of a run: a new one, or one that holds the same run, finished or not.
 
     A run with the first ones of the seeds is the same run, and is added to. Invalid episodes, which
-    the host disturbed, are taken out of it: they are not there.
-
-    Args:
-        out: The folder; None makes a new one.
-        name: Name of a new run.
-        scenario: What is flown.
-
-    Returns:
-        The folder, and the episodes that it holds.
-
-    Raises:
-        UsageError: It holds something else, or another run.
+    the host disturbed, are taken out of it: they are not there. Return the folder and its episodes;
+    UsageError if it holds something else, or another run.
     """
     config, seeds = scenario.config, scenario.seeds
     if out is not None:
@@ -305,10 +260,7 @@ def open_folder(
 def another_config(
     held: Mapping[str, Any], asked: Mapping[str, Any], free: Collection[str] = free_fields("gym")
 ) -> str | None:
-    """Return the first setting in which two configurations differ, or None when they do not.
-
-    Settings in `free` are passed over, a table of them by its name.
-    """
+    """Return the first setting, or table of them, not in `free` that differs, or None."""
     old, new = _flat(held), _flat(json.loads(json.dumps(asked)))
     for key in sorted(old.keys() | new.keys()):
         known = key in free or key.partition(".")[0] in free
@@ -319,24 +271,20 @@ def another_config(
 
 def load_info(path: Path) -> RunInfo:
     """Read `run.json` alone. Raises UsageError."""
-    return read_typed(path / RUN_FILE, _INFO, SCHEMA, "run")
+    return files.read_typed(path / RUN_FILE, _INFO, SCHEMA, "run")
 
 
 def run_info(data: Mapping[str, Any], source: object) -> RunInfo:
     """Return what an object says, as `run.json` holds it. Raises UsageError, with the source."""
-    return typed(_INFO, data, source)
+    return files.typed(_INFO, data, source)
 
 
 def load(path: Path) -> LoadedRun:
-    """Read a run folder back; a last line cut short by a kill is passed over.
-
-    Raises:
-        UsageError: The folder holds no run, or a file of it cannot be read or is damaged.
-    """
+    """Read a run folder back, or raise UsageError; a last line cut short is passed over."""
     info = load_info(path)
     records: dict[int, EpisodeRecord] = {}
     stamp_crcs, path_crcs = {}, {}
-    for place, data in read_lines(path / EPISODES_FILE, LINE_SCHEMA):
+    for place, data in files.read_lines(path / EPISODES_FILE, LINE_SCHEMA):
         record = EpisodeRecord.from_data(data, place)
         # A later line replaces an earlier one. Lines of earlier versions have no CRC.
         records[record.index] = record
@@ -360,27 +308,19 @@ def info_data(info: RunInfo) -> dict[str, Any]:
 
 def _write_info(path: Path, info: RunInfo) -> None:
     """Write `run.json`."""
-    write_json(path, info_data(info))
+    files.write_json(path, info_data(info))
 
 
-def _load_arrays(path: Path, crcs: Mapping[int, Any]) -> dict[int, Arrays]:
-    """Return the arrays of the episodes that have a line, by index.
-
-    Args:
-        path: The archive.
-        crcs: What each episode's line says of its arrays; None in lines of earlier versions.
-
-    Raises:
-        UsageError: The archive is damaged, or lacks or has other arrays than the lines say.
-    """
-    groups = read_groups(path)
+def _load_arrays(path: Path, crcs: Mapping[int, Any]) -> dict[int, files.Arrays]:
+    """Return the arrays of the episodes that have a line, by index; UsageError: damaged."""
+    groups = files.read_groups(path)
     found = {}
     for index, crc in crcs.items():
-        group = groups.get(f"{index:03d}", NO_ARRAYS)
+        group = groups.get(f"{index:03d}", files.NO_ARRAYS)
         if crc is not None and group.crc32 != crc:
             raise UsageError(
-                f"{path}: arrays of episode {index}: {CRC} = {group.crc32!r}: accepted: {crc!r}, "
-                f"that of {EPISODES_FILE}"
+                f"{path}: arrays of episode {index}: {files.CRC} = {group.crc32!r}: "
+                f"accepted: {crc!r}, that of {EPISODES_FILE}"
             )
         if group.arrays:
             found[index] = group.arrays

@@ -44,17 +44,7 @@ class Listener:
 def fly_vehicle(
     asked: StandAloneVehicle, stop: threading.Event, listener: Listener | None = None
 ) -> None:
-    """Fly whatever clients ask for, in real time or at another pace.
-
-    Args:
-        asked: What flies, and where.
-        stop: Set from outside to end it.
-        listener: Who is told what happens.
-
-    Raises:
-        UsageError: The input cannot be used.
-        FirmwareLostError: Real firmware is gone.
-    """
+    """Fly whatever clients ask for until `stop`; UsageError or FirmwareLostError."""
     listener = listener or Listener()
     check_vehicle(asked)
     vehicle, computer_w = aircraft_of(asked)
@@ -95,11 +85,7 @@ def fly_vehicle(
 
 
 def aircraft_of(asked: StandAloneVehicle) -> tuple[VehicleProfile, float]:
-    """Return the vehicle with what it carries, and the power of its computer [W].
-
-    Raises:
-        UsageError: A profile cannot be used, or the rotors do not carry it all.
-    """
+    """Return the vehicle with what it carries, and the power of its computer [W], or UsageError."""
     vehicle, computer = equipped(asked.vehicle, asked.computer, asked.payload)
     check_spread(vehicle, asked.spread)
     further = vehicle.cameras.values()
@@ -111,16 +97,7 @@ def aircraft_of(asked: StandAloneVehicle) -> tuple[VehicleProfile, float]:
 def episode_of(
     asked: StandAloneVehicle, vehicle: VehicleProfile, computer_w: float
 ) -> tuple[EpisodeSetup, Goal]:
-    """Return the episode that is flown, and its goal.
-
-    Args:
-        asked: Where it is flown, and in what.
-        vehicle: With what it carries.
-        computer_w: What its computer draws from the pack [W].
-
-    Raises:
-        UsageError: No arena can be made of the seed, or it cannot be drawn as asked.
-    """
+    """Return the episode of a laden vehicle, and its goal; UsageError: no such arena."""
     spec = load_profile("arenas", asked.arena, ArenaSpec)
     check_renderer(vehicle.camera, asked.renderer, spec, vehicle.cameras.values())
     width_m = vehicle.body.width_m

@@ -1,7 +1,4 @@
-"""How an episode is followed to its end: when the referee decides, and what the companion is told.
-
-One set of rules for every level that flies with a companion.
-"""
+"""How an episode is followed to its end, by one set of rules for levels with a companion."""
 
 from __future__ import annotations
 
@@ -14,8 +11,8 @@ TAKEOFF_LIMIT_S = 90.0
 """Longest time from the reset to the start of navigation [simulated s]."""
 
 ARRIVAL_S = 10.0
-"""Longest time from the goal's edge to where the companion thinks the goal is [simulated s];
-then it is told to land where it is."""
+"""Longest time from the goal's edge to where the companion thinks the goal is [simulated s].
+Then it is told to land where it is."""
 
 
 class Order(Enum):

@@ -82,15 +82,7 @@ class Tally:
         done: Sequence[EpisodeRecord],
         planned: int,
     ) -> None:
-        """Open a bar.
-
-        Args:
-            progress: Who is shown it.
-            label: What the bar is called.
-            folder: Of the run.
-            done: Flights that were there before.
-            planned: Number of flights in all.
-        """
+        """Open a bar of that label, with the flights that were there before."""
         self._progress, self._folder = progress, folder
         self._reached = list(reached_goals(done))
         self._bar = progress.bar(label, planned, completed=len(done), unit="flights")

@@ -85,11 +85,7 @@ def still(
     rays: int,
     range_m: float,
 ) -> Pixels:
-    """Return a ray-cast picture; arguments as of `render.render`, `range_m` is drawn darkest.
-
-    `show` is its content, except flow (see `report.ground_truth`), `rays` the number per pixel and
-    axis for rgb and grey.
-    """
+    """Return a ray-cast picture of anything but flow, with `rays` a pixel for colours."""
     if show in ("rgb", "grey"):
         rgb = antialiased(arena, centers, camera, position, quaternion, rays)
         return rgb if show == "rgb" else grey(rgb)
@@ -102,8 +98,7 @@ def still(
 def moments(flight: ReplayedFlight, rate_hz: float) -> range:
     """Return the picture times [µs] of a film, from the start of navigation to the end."""
     path, record = flight.path, flight.record
-    begin = record.started_us if record.navigation_us is None else record.navigation_us
-    begin, end = max(begin, int(path.time_us[0])), int(path.time_us[-1])
+    begin, end = max(record.zero_us, int(path.time_us[0])), int(path.time_us[-1])
     return range(begin, end + 1, period_ms(rate_hz) * US_PER_MS)
 
 
@@ -134,12 +129,9 @@ def write_png(path: Path, pixels: Pixels) -> None:
 
 
 def write_film(path: Path, pictures: Iterator[Pixels], rate_hz: float) -> int:
-    """Write an animated GIF or WebP, or a video, by the suffix; return the number of pictures.
+    """Write an animated GIF or WebP, or a video; return the number of pictures.
 
-    Raises:
-        UsageError: A video has an odd width or height.
-        OSError: The file cannot be written.
-        ImportError: Videos need PyAV: the extra `film`.
+    A video needs even sides (UsageError) and the extra `film` (ImportError).
     """
     if path.suffix.lower() == VIDEO:
         written, count = _video(pictures, period_ms(rate_hz))

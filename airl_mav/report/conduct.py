@@ -11,15 +11,13 @@ from airl_mav.core.errors import UsageError
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.smoothness import BANDWIDTH_HZ, command_steps
 from airl_mav.flight.statistics import known, successful
-from airl_mav.latency.deadlines import deadline_miss_ratio
 from airl_mav.latency.percentiles import percentile
-from airl_mav.latency.stages import Samples
+from airl_mav.latency.stages import Samples, deadline_miss_ratio
 from airl_mav.policy.registry import find_policy
 from airl_mav.rehearsal.run_folder import LoadedRun
+from airl_mav.report import measures
 from airl_mav.report.arenas import vehicle_of
-from airl_mav.report.measures import COMMAND_STEP, CONDUCT, DEADLINE_MISSES, JERK, Measure
-from airl_mav.report.run_summary import RunSummary
-from airl_mav.report.table import NONE, TOO_FEW_CELL, Column, TableView
+from airl_mav.report.table import NONE, TOO_FEW_CELL, TableView, columns_of
 
 CONDUCT_NOTE = (
     "Deadline misses: decisions that took effect later than the hold time after their frame was "
@@ -69,10 +67,10 @@ def _budget(run: LoadedRun) -> Budget | None:
     )
 
 
-def conduct_table(run: LoadedRun, summary: RunSummary) -> TableView | None:
+def conduct_table(run: LoadedRun, summary: measures.RunSummary) -> TableView | None:
     """Return deadlines and smoothness; None of a run that was recorded without them."""
     q = summary.quality
-    if not any(measure.of(q).n for measure in CONDUCT):
+    if not any(measure.of(q).n for measure in measures.CONDUCT):
         return None
     reached = [e for e in run.episodes if e.outcome is Outcome.SUCCESS and not e.invalid]
     good = successful(reached)
@@ -80,10 +78,12 @@ def conduct_table(run: LoadedRun, summary: RunSummary) -> TableView | None:
     steps = np.concatenate(
         [np.zeros(0), *(command_steps(run.latency.get(e.index, {})) for e in reached)]
     )
-    p95 = percentile(steps, 95.0)
-    n = f"{steps.size:,}"
+    p95, n = percentile(steps, 95.0), f"{steps.size:,}"
+    tail = f"{p95:.2f} m/s" if p95 is not None else TOO_FEW_CELL if steps.size else NONE
+    greatest_step = f"{steps.max():.2f} m/s" if steps.size else NONE
+    rms = f"{np.mean(command_rms):,.2f} m/s³" if command_rms else NONE
 
-    def mean(measure: Measure) -> tuple[str, ...]:
+    def mean(measure: measures.Measure) -> tuple[str, ...]:
         of = measure.of(q)
         interval = NONE if of.low is None else f"{measure.plain(of.low)} … {measure.plain(of.high)}"
         return measure.title, measure.plain(of.value, unit=True), interval, f"{of.n:,}"
@@ -95,37 +95,17 @@ def conduct_table(run: LoadedRun, summary: RunSummary) -> TableView | None:
 
     budget = _budget(run)
     rows = (
-        mean(DEADLINE_MISSES),
+        mean(measures.DEADLINE_MISSES),
         *(() if budget is None else (budget.row(summary.samples["t2"]),)),
-        mean(JERK),
+        mean(measures.JERK),
         greatest("jerk, flown, peak", "jerk_peak_m_s3"),
-        (
-            "jerk, commanded, RMS",
-            f"{np.mean(command_rms):,.2f} m/s³" if command_rms else NONE,
-            NONE,
-            f"{len(command_rms):,}",
-        ),
+        ("jerk, commanded, RMS", rms, NONE, f"{len(command_rms):,}"),
         greatest("jerk, commanded, peak", "command_jerk_peak_m_s3"),
-        mean(COMMAND_STEP),
-        (
-            "step of the command, p95",
-            f"{p95:.2f} m/s" if p95 is not None else TOO_FEW_CELL if steps.size else NONE,
-            NONE,
-            n,
-        ),
-        (
-            "step of the command, greatest",
-            f"{steps.max():.2f} m/s" if steps.size else NONE,
-            NONE,
-            n,
-        ),
+        mean(measures.COMMAND_STEP),
+        ("step of the command, p95", tail, NONE, n),
+        ("step of the command, greatest", greatest_step, NONE, n),
     )
-    columns = (
-        Column("measure", number=False),
-        Column("value"),
-        Column("95 % interval"),
-        Column("n"),
-    )
+    columns = columns_of("<measure | value | 95 % interval | n")
     notes = [CONDUCT_NOTE, *(() if budget is None else (budget.note,))]
     if not summary.timed:
         notes.append(

@@ -16,7 +16,7 @@ from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report import theme
 from airl_mav.report.run_tables import failures_first
-from airl_mav.report.table import NONE, Column, TableView
+from airl_mav.report.table import NONE, Column, TableView, columns_of
 
 ENERGY_NAME = "energy"
 
@@ -81,12 +81,7 @@ def flight_energies(run: LoadedRun, vehicle: VehicleProfile | None) -> list[Flig
 
 def energy_table(flights: Sequence[FlightEnergy], *, on_ground: bool = False) -> TableView:
     """Return the energy of all flights together, by part; a computer `on_ground` has no row."""
-    columns = (
-        Column("part", number=False),
-        Column("all flights", "kJ"),
-        Column("share", "%"),
-        Column("mean power", "W"),
-    )
+    columns = columns_of("<part | all flights [kJ] | share [%] | mean power [W]")
     time_s = sum(f.quality.flight_time_s for f in flights)
     airframe = sum(f.airframe_j for f in flights)
     computer = sum(f.quality.computer_energy_j for f in flights)
@@ -164,7 +159,7 @@ def energy_figure(flights: Sequence[FlightEnergy], *, on_ground: bool = False) -
     parts = PARTS if whole else (("", "airframe", theme.SERIES), PARTS[-1])
     for name, title, colour in parts[:-1] if on_ground else parts:
         values = np.array([_joules(f, name) for f in ranked]) / 1e3
-        # What is below 0 hangs below the axis: the bar above it is longer than the energy drawn.
+        # What is below 0 hangs below the axis. The bar above it is longer than the energy drawn.
         base = np.where(values < 0.0, below, above)
         if many:
             ax.fill_between(x, base, base + values, color=colour, lw=0, step="mid", label=title)

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from airl_mav.camera.frame import rgb_of
 from airl_mav.core.constants import US_PER_MS
 from airl_mav.core.files import Arrays
-from airl_mav.latency.series import decision_series
-from airl_mav.latency.stages import STAGES
+from airl_mav.latency.stages import STAGES, decision_series
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.report.depth_colours import shades
 from airl_mav.report.policy_view import PolicyAgain, SeenDecision
@@ -37,11 +36,6 @@ LEVEL = 7
 def packed(text: str) -> str:
     """Return a text as base64 of gzip. The same text gives the same bytes."""
     return base64.b64encode(gzip.compress(text.encode(), compresslevel=LEVEL, mtime=0)).decode()
-
-
-def unpacked(data: str) -> str:
-    """Return the text that `packed` was given."""
-    return gzip.decompress(base64.b64decode(data)).decode()
 
 
 def steps_of(values: NDArray[np.float64] | Sequence[float], unit: float) -> Steps:

@@ -59,16 +59,7 @@ class TakingCamera:
 def taken_film(
     flight: ReplayedFlight, camera: TakingCamera, moments: Iterable[int]
 ) -> Iterator[Pixels]:
-    """Yield what a camera takes along the way of a recorded flight.
-
-    Args:
-        flight: The flight.
-        camera: The camera.
-        moments: When [µs].
-
-    Raises:
-        UsageError: The arena of the flight cannot be made any more.
-    """
+    """Yield what a camera takes along a recorded flight; UsageError if its arena cannot be made."""
     if flight.arena is None:
         raise UsageError(f"flight {flight.label}: its arena cannot be made any more")
     for time_us in moments:
@@ -106,20 +97,12 @@ TRUTHS: Final = tuple(name for name in get_args(Shown) if name not in ("rgb", "g
 def truth_of(
     show: Shown, arena: Arena, elapsed_us: int, camera: Intrinsics, motion: CameraMotion
 ) -> NDArray[Any]:
-    """Return what each pixel shows.
+    """Return what each pixel shows, some time after the episode's start.
 
-    Args:
-        show: One of `TRUTHS`.
-        arena: What is seen.
-        elapsed_us: Time since the episode's start [µs].
-        camera: Intrinsics.
-        motion: How the camera moves.
-
-    Returns:
-        Of `depth` float32 (h, w) [m], as the camera's projection measures it, without a limit of
-        range, 0 where there is no surface. Of `segmentation` int32 (h, w): 0 sky, 1 floor, 2 a wall
-        across north, 3 one across east, 4 + i obstacle i. Of `flow` float32 (h, w, 2): columns and
-        rows a second [px/s], NaN where a fisheye sees nothing.
+    Of `depth` float32 (h, w) [m], as the camera's projection measures it, without a limit of range,
+    0 where there is no surface. Of `segmentation` int32 (h, w): 0 sky, 1 floor, 2 a wall across
+    north, 3 one across east, 4 + i obstacle i. Of `flow` float32 (h, w, 2): columns and rows a
+    second [px/s], NaN where a fisheye sees nothing.
     """
     centers = arena.centers_at(elapsed_us)
     picture = render_picture(arena, centers, camera, motion.position, motion.quaternion)
@@ -133,11 +116,7 @@ def truth_of(
 def truth_film(
     show: Shown, flight: ReplayedFlight, camera: Intrinsics, moments: Iterable[int]
 ) -> Iterator[NDArray[Any]]:
-    """Yield `truth_of` along a recorded flight, for a camera mounted as the vehicle's.
-
-    Raises:
-        UsageError: The arena of the flight cannot be made any more.
-    """
+    """Yield `truth_of` along a recorded flight, for a camera mounted as the vehicle's."""
     if flight.arena is None:
         raise UsageError(f"flight {flight.label}: its arena cannot be made any more")
     mount = PolicyCamera.of(flight.vehicle.camera).mount
@@ -151,7 +130,7 @@ def truth_film(
 def coloured_flow(flow: NDArray[np.float32]) -> Pixels:
     """Return flow (h, w, 2) as a picture: hue = direction, saturation = speed.
 
-    Red moves right, then clockwise; saturation is full at the 99th percentile.
+    Red moves right, then clockwise. Saturation is full at the 99th percentile.
     """
     across, down = np.nan_to_num(flow[..., 0]), np.nan_to_num(flow[..., 1])
     speed = np.hypot(across, down)

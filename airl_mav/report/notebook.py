@@ -16,14 +16,13 @@ from airl_mav.report.comparison.tables import runs_table
 from airl_mav.report.document import Headline, environment
 from airl_mav.report.flights_above import overview_picture
 from airl_mav.report.forensics.worst import flown_path
-from airl_mav.report.measures import MEASURES
+from airl_mav.report.measures import MEASURES, summarize_run
 from airl_mav.report.run_figures import map_figure
 from airl_mav.report.run_page import run_headlines
 from airl_mav.report.run_report import verdict_of
-from airl_mav.report.run_summary import summarize_run
 from airl_mav.report.scene import SceneFlight, top_speed
 from airl_mav.report.shown_flights import pictured
-from airl_mav.report.table import Column, TableView
+from airl_mav.report.table import TableView, columns_of
 from airl_mav.report.theme import Picture
 from airl_mav.report.verdict import OverallVerdict, load_verdict
 
@@ -49,7 +48,7 @@ def comparison_html(
 
 
 def _figures(headlines: list[Headline]) -> TableView:
-    columns = (Column("measure", number=False), Column("value"), Column("95 % interval, n"))
+    columns = columns_of("<measure | value | 95 % interval, n")
     rows = tuple((each.title, f"{each.value} {each.unit}", each.detail) for each in headlines)
     return TableView("figures", "", columns, rows)
 

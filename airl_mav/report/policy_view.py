@@ -1,7 +1,6 @@
 """The policy's inputs and choices, recomputed decision by decision from a recording.
 
-Images are rendered from the true pose at exposure, without noise, by the ray caster of the flight;
-telemetry is the recorded estimate. A learned policy is evaluated again on both.
+Images are rendered from the true pose, without noise. Telemetry is the recorded estimate.
 """
 
 from __future__ import annotations
@@ -25,17 +24,10 @@ from airl_mav.core.plugins import names_code
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory, pose_at
 from airl_mav.latency.stamps import NO_STAMP, SETPOINT, setpoint_column
+from airl_mav.policy import observation
 from airl_mav.policy.action_sets import commands, discrete_actions
 from airl_mav.policy.layouts import encode_layout
 from airl_mav.policy.learned import LearnedPolicy, load_learned
-from airl_mav.policy.observation import (
-    Earlier,
-    InFlight,
-    Kinematics,
-    Observation,
-    View,
-    observe,
-)
 from airl_mav.policy.observation_spec import MOST_FRAMES
 from airl_mav.policy.registry import find_policy
 from airl_mav.prediction.compensator import Compensator
@@ -83,11 +75,7 @@ class PolicyAgain:
 
 
 def policy_again(info: RunInfo) -> PolicyAgain | None:
-    """Return the policy of a run if it has discrete actions and its file is here unchanged.
-
-    Code from the run folder is never executed: policies that are code, or whose card names code,
-    are skipped.
-    """
+    """Return a run's policy if it has discrete actions, no code, and its file is unchanged."""
     name, digest = info.config.get("policy"), info.config.get("policy_sha256")
     if not isinstance(name, str) or digest is None or names_code(name):
         return None
@@ -112,7 +100,7 @@ def seen_decisions(
     vehicle: VehicleProfile,
     again: PolicyAgain | None = None,
 ) -> Iterator[SeenDecision]:
-    """Yield the recorded decisions of a flight in order; scores need the policy in `again`."""
+    """Yield the decisions of a flight until its outcome; scores need the policy in `again`."""
     path, stamps = run.trajectories.get(record.index), run.latency.get(record.index, {})
     column = setpoint_column(stamps) or SETPOINT
     needed = ("capture_us", "infer_start_us", "action_ready_us", "sent_us", column)
@@ -132,7 +120,7 @@ def seen_decisions(
     policy = None if again is None else again.policy.with_generator(np.random.default_rng(0))
     for number in range(min(MOST, len(stamps["sent_us"]))):
         captured, began, ready, sent = (int(stamps[name][number]) for name in needed[:4])
-        if NO_STAMP in (captured, began, ready, sent):
+        if NO_STAMP in (captured, began, ready, sent) or sent > record.ended_us:
             continue
         image, state = lens.image(captured), _telemetry(stamps, path, began)
         views = {name: each.view(captured) for name, each in further.items()}
@@ -175,11 +163,11 @@ class _Further:
         self._lens = lens
         self._earlier: deque[NDArray[Any]] = deque(maxlen=MOST_FRAMES - 1)
 
-    def view(self, time_us: int) -> View:
+    def view(self, time_us: int) -> observation.View:
         """Return what a decision sees of an image that was taken at a time; keep it."""
         image, earlier = self._lens.image(time_us), tuple(self._earlier)
         self._earlier.appendleft(image)
-        return View(image, self._lens.camera.intrinsics, earlier)
+        return observation.View(image, self._lens.camera.intrinsics, earlier)
 
 
 class _Companion:
@@ -195,17 +183,17 @@ class _Companion:
         else:
             self._memory = DecisionMemory(1)
             self._memory.begin(0)
-        self._earlier: Earlier = ()
+        self._earlier: observation.Earlier = ()
 
     def observe(
         self,
         image: NDArray[Any],
-        state: Kinematics,
+        state: observation.Kinematics,
         goal: Goal,
         age_us: int,
         now_us: int,
-        further: Mapping[str, View],
-    ) -> Observation:
+        further: Mapping[str, observation.View],
+    ) -> observation.Observation:
         """Return what the policy sees: what is, or what will be when its action is sent."""
         age = np.array([age_us])
         if self._compensator is not None:
@@ -217,8 +205,7 @@ class _Companion:
         earlier = self._earlier
         self._earlier = ((image, state), *earlier)[: MOST_FRAMES - 1]
         where = np.asarray(goal, np.float64)
-        in_flight = InFlight(told.latency_s, told.age_s, told.setpoint)
-        return observe(image, self._intrinsics, state, where, in_flight, earlier, further)
+        return observation.observe(image, self._intrinsics, state, where, told, earlier, further)
 
     def decided(
         self, setpoint: NDArray[np.float64], t2_us: int, sent_us: int, stops_us: int | None
@@ -232,11 +219,11 @@ class _Companion:
         self._compensator.decided(ONE, command, t2, np.array([sent_us]), stops)
 
 
-def _telemetry(stamps: Arrays, path: Trajectory, time_us: int) -> Kinematics:
+def _telemetry(stamps: Arrays, path: Trajectory, time_us: int) -> observation.Kinematics:
     """Return the newest estimate at a time; the true state where none was recorded."""
     if not len(stamps.get("estimate/time_us", ())):
-        return Kinematics(*pose_at(path, time_us))
+        return observation.Kinematics(*pose_at(path, time_us))
     at = max(0, int(np.searchsorted(stamps["estimate/time_us"], time_us, side="right")) - 1)
-    return Kinematics(
+    return observation.Kinematics(
         *(stamps[f"estimate/{name}"][at] for name in ("position", "velocity", "quaternion"))
     )

@@ -78,13 +78,7 @@ def info_of(box: BlackBox, digest: str = "") -> RunInfo:
 def episode_of(
     box: BlackBox, path: Trajectory | None = None, remarks: tuple[str, ...] = ()
 ) -> FlownEpisode:
-    """Return the flight of a black box; UsageError without its settings.
-
-    Args:
-        box: The recording.
-        path: A more accurate path; None = the flight controller's telemetry.
-        remarks: Notes that precede those of the recording.
-    """
+    """Return the flight of a black box, or UsageError; a `path` replaces its telemetry."""
     asked = settings_of(box)
     path = path_of(box) if path is None else path
     stamps = stamps_of(box)
@@ -161,10 +155,7 @@ def stamps_of(box: BlackBox) -> dict[str, NDArray[Any]]:
 
 
 def _power_w(statuses: list[Status], times_us: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the newest known power (n,) at times (n,); NaN if never measured.
-
-    Older recordings hold PX4's -1 A where current is not measured.
-    """
+    """Return the newest power (n,) at times (n,); NaN: never measured, or -1 A as of old PX4."""
     told = [
         (status.time_us, status.voltage_v * status.current_a)
         for status in statuses
@@ -200,10 +191,7 @@ def _cut(box: BlackBox, ended_us: int) -> tuple[str, tuple[str, ...]]:
 def _arrived_us(
     path: Trajectory, navigation_us: int | None, ended_us: int, asked: FlownSettings
 ) -> int | None:
-    """Return the arrival time at the goal [µs] by the referee's rule; None = never.
-
-    The companion checks once per decision and therefore notices later.
-    """
+    """Return when the goal was reached by the referee's rule [µs], before the companion saw it."""
     if navigation_us is None:
         return None
     flown = path.between(navigation_us, ended_us)

@@ -27,11 +27,7 @@ from airl_mav.vehicle_log.ulog import VehicleLog
 
 
 def logged_episode_of(box: BlackBox, log: VehicleLog) -> FlownEpisode:
-    """Return the flight with path, power and motor outputs of the vehicle's log.
-
-    Raises:
-        UsageError: The black box has no settings, or the log is of another flight.
-    """
+    """Return the flight with path, power and motor outputs of the vehicle's log, or UsageError."""
     told = path_of(box)
     stamps = stamps_of(box)
     kind = commanded(stamps)
@@ -95,16 +91,7 @@ WITH_LOG = "-with-log"
 
 
 def take_in(path: Path, ulg: Path | None = None) -> Path:
-    """Return the run folder of a black box, created beside it if missing.
-
-    Args:
-        path: The black box.
-        ulg: The vehicle's own log; None = companion data only.
-
-    Raises:
-        UsageError: The file is no black box, the log is of another flight, or the folder holds
-            other files.
-    """
+    """Return the run folder of a black box and its vehicle's log, created beside it if missing."""
     box = read_black_box(path)
     folder = path.with_suffix("") if ulg is None else path.with_name(f"{path.stem}{WITH_LOG}")
     digest = hashlib.sha256(path.read_bytes()).hexdigest()

@@ -12,7 +12,7 @@ from airl_mav.envs.roofline import Bound, Roofline, RooflinePoint
 from airl_mav.latency.f1_model import f1_velocity
 from airl_mav.report import theme
 from airl_mav.report.document import Document, Facts, Section, provenance_facts
-from airl_mav.report.table import Column, TableView
+from airl_mav.report.table import TableView, columns_of
 
 BINDS: dict[Bound, str] = {
     "body": "body: beyond the knee, deciding sooner gains little",
@@ -79,14 +79,9 @@ def _facts(found: Roofline) -> Facts:
 
 def velocity_table(found: Roofline) -> TableView:
     """Return the safe velocity on each computer: model, measurement, flight, and the roofs."""
-    columns = (
-        Column("computer", number=False),
-        Column("F-1", "m/s"),
-        Column("measured", "m/s"),
-        Column("flown", "m/s"),
-        Column("roof, F-1", "m/s"),
-        Column("roof", "m/s"),
-        Column("binds", number=False),
+    columns = columns_of(
+        "<computer | F-1 [m/s] | measured [m/s] | flown [m/s] | "
+        "roof, F-1 [m/s] | roof [m/s] | <binds"
     )
     rows = tuple(
         (
@@ -110,13 +105,8 @@ def velocity_table(found: Roofline) -> TableView:
 
 def aircraft_table(found: Roofline) -> TableView:
     """Return what each computer costs the aircraft, and the missions that its pack then holds."""
-    columns = (
-        Column("computer", number=False),
-        Column("on board", "g"),
-        Column("draws", "W"),
-        Column("take-off mass", "kg"),
-        Column("power", "W"),
-        Column("missions"),
+    columns = columns_of(
+        "<computer | on board [g] | draws [W] | take-off mass [kg] | power [W] | missions"
     )
     rows = tuple(
         (
@@ -138,16 +128,9 @@ def aircraft_table(found: Roofline) -> TableView:
 
 def reaction_table(found: Roofline) -> TableView:
     """Return what the reaction time of each computer is made of, and its knee."""
-    columns = (
-        Column("computer", number=False),
-        Column("sensor", "s"),
-        Column("2 x t2", "s"),
-        Column("hold", "s"),
-        Column("link", "s"),
-        Column("T", "s"),
-        Column("1 / T", "Hz"),
-        Column("knee, F-1", "Hz"),
-        Column("knee", "Hz"),
+    columns = columns_of(
+        "<computer | sensor [s] | 2 x t2 [s] | hold [s] | link [s] | "
+        "T [s] | 1 / T [Hz] | knee, F-1 [Hz] | knee [Hz]"
     )
     rows = tuple(
         (

@@ -118,14 +118,7 @@ def _bin_edges(values: NDArray[np.float64]) -> list[float]:
 def map_figure(
     episode: EpisodeRecord, trajectory: Trajectory | None, arena: Arena | None, top_speed: float
 ) -> theme.Picture:
-    """Draw a flight from above over its arena, as it was at the flight's end.
-
-    Args:
-        episode: The flight.
-        trajectory: Its path; None = arena alone.
-        arena: Its arena; None = path and goal alone.
-        top_speed: Upper end of the colour scale [m/s].
-    """
+    """Draw a flight from above over its arena, as it was at the flight's end, as far as known."""
     tall = 1.0
     if arena is not None:
         b = arena.bounds
@@ -212,11 +205,7 @@ def speed_bar(bar: Colorbar) -> None:
 def coloured_pieces(
     points: NDArray[np.float64], values: NDArray[np.float64], top: float
 ) -> tuple[list[NDArray[np.float64]], NDArray[np.float64]]:
-    """Split a line (n, 2) where the colour of its segments' values (n - 1,) changes.
-
-    Returns:
-        Connected pieces, each (k, 2), and their values.
-    """
+    """Split a line (n, 2) where the colour of its segments' values (n - 1,) changes."""
     step = top / PATH_COLOURS
     levels = np.clip((values / step).astype(int), 0, PATH_COLOURS - 1)
     cuts = np.flatnonzero(np.diff(levels)) + 1

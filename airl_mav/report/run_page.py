@@ -15,7 +15,6 @@ from airl_mav.core.files import replace_file
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report import document, run_tables
-from airl_mav.report.ages import ages_table, estimation_table, run_ages
 from airl_mav.report.conduct import conduct_table
 from airl_mav.report.energy import (
     energy_figure,
@@ -23,13 +22,12 @@ from airl_mav.report.energy import (
     energy_table,
     flight_energies,
 )
-from airl_mav.report.faults import faults_table
 from airl_mav.report.flight_data import BEST, packed
 from airl_mav.report.flights_above import overview_picture
 from airl_mav.report.forensics.worst import causes_table, examine_worst, worst_table
-from airl_mav.report.measures import rate_digits
+from airl_mav.report.measures import RunSummary, rate_digits, summarize_run
 from airl_mav.report.run_figures import latency_figure
-from airl_mav.report.run_summary import RunSummary, summarize_run
+from airl_mav.report.run_tables import ages_table, estimation_table, faults_table, run_ages
 from airl_mav.report.scene import ALL_FLIGHTS, plotly_script
 from airl_mav.report.shown_flights import (
     ShownFlights,
@@ -63,15 +61,7 @@ def build_page(
     vehicle: VehicleProfile | None = None,
     verdict: OverallVerdict | None = None,
 ) -> Path:
-    """Write `report.html` and its PNG files, each atomically; return the page's path.
-
-    Args:
-        run: The run.
-        arenas: Arenas by episode index; others are drawn without.
-        out: Output folder; None = the run's.
-        vehicle: The vehicle; None = less detail in energy and causes.
-        verdict: The verdict shown first.
-    """
+    """Write `report.html` and its PNG files, each atomically; return the page's path."""
     folder = out or run.path
     folder.mkdir(parents=True, exist_ok=True)
     summary = summarize_run(run)

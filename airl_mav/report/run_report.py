@@ -18,8 +18,8 @@ from airl_mav.report import run_tables
 from airl_mav.report.arenas import arenas_of, vehicle_of
 from airl_mav.report.conduct import conduct_table
 from airl_mav.report.document import print_place, print_verdict
-from airl_mav.report.faults import faults_table
-from airl_mav.report.run_summary import summarize_run
+from airl_mav.report.measures import summarize_run
+from airl_mav.report.run_tables import faults_table
 from airl_mav.report.table import count_outcomes, print_facts, print_table
 from airl_mav.report.verdict import (
     OverallVerdict,
@@ -34,11 +34,7 @@ MAX_LISTED = 25
 
 
 def verdict_of(run: LoadedRun, requirements: Sequence[Requirement] | None = None) -> OverallVerdict:
-    """Return a run's verdict; `requirements` None = those of its `verdict.json`.
-
-    Raises:
-        FieldError: A gap is required: a single run has no reference.
-    """
+    """Return a run's verdict by requirements, or by those of its `verdict.json`."""
     if requirements is None:
         requirements = requirements_of(run.path)
     verdict = judge_run(run.info.setup, aggregate(run.episodes), run.episodes, requirements)
@@ -49,16 +45,7 @@ def verdict_of(run: LoadedRun, requirements: Sequence[Requirement] | None = None
 def write_report(
     run: LoadedRun | Path, out: Path | None = None, verdict: OverallVerdict | None = None
 ) -> Path:
-    """Write a run's `report.html`, `verdict.json` and PNG files; return the page's path.
-
-    Args:
-        run: The run, or its folder.
-        out: Output folder; None = the run's.
-        verdict: The verdict shown first; None = `verdict_of`.
-
-    Raises:
-        UsageError: The folder holds no run, a file is damaged, or a profile is missing or unusable.
-    """
+    """Write a run's `report.html`, `verdict.json` and PNG files; return the page's path."""
     # Imported here: the figures take as long to load as ten flights to be flown and judged.
     from airl_mav.report.forensics.evidence import ranked
     from airl_mav.report.forensics.worst import EXAMINED
@@ -106,21 +93,7 @@ def show_report(
     *,
     draw: bool = True,
 ) -> Path | None:
-    """Print the report of a run, then draw its page and print where it lies.
-
-    Args:
-        run: The run.
-        verdict: Verdict shown first, saved as `verdict.json`.
-        console: Output of verdict and tables.
-        progress: Reports that the page is being drawn.
-        draw: False = print the command that draws the page instead.
-
-    Returns:
-        The path of the page; None = not drawn.
-
-    Raises:
-        UsageError: As of `write_report`, after the tables are printed.
-    """
+    """Print the report of a run, then draw its page, or print the command that draws it."""
     progress = progress or Progress()
     if run.episodes:
         save_verdict(verdict, run.path)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,9 +12,9 @@ from numpy.typing import NDArray
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.process_use import ProcessUse
 from airl_mav.flight.judge import Outcome
-from airl_mav.flight.record import EpisodeRecord, run_sha256
-from airl_mav.flight.setup import Part, Setup
+from airl_mav.flight.record import EpisodeRecord, Part, Setup, run_sha256
 from airl_mav.flight.statistics import NO_ESTIMATE, Estimate
+from airl_mav.latency.coordinated_omission import CommandAges, command_ages
 from airl_mav.latency.percentiles import Summary, summarize
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.rehearsal.run_folder import EPISODES_FILE, TICK_LATENESS, LoadedRun
@@ -28,9 +29,10 @@ from airl_mav.report.measures import (
     PACK,
     SUCCESS_RATE,
     Measure,
+    RunSummary,
     rate_digits,
 )
-from airl_mav.report.run_summary import RunSummary
+from airl_mav.report.tracking import TrackedFlight
 
 BYTES_PER_MIB = 1 << 20
 
@@ -70,11 +72,8 @@ def _part(part: Part) -> str:
 
 def latency_table(summary: RunSummary) -> table.TableView:
     """Return the latencies by stage."""
-    columns = (
-        table.Column("stage", number=False),
-        *table.DURATION_COLUMNS,
-        table.Column("from → to", number=False, page_only=True),
-    )
+    head, last = table.columns_of("<stage | *<from → to")
+    columns = (head, *table.DURATION_COLUMNS, last)
     rows, short = [], False
     for stage in summary.shown_stages:
         cells = table.duration_cells(summary.stages[stage.key])
@@ -100,19 +99,10 @@ def failures_first(episodes: Sequence[EpisodeRecord], most: int) -> list[Episode
 def episodes_table(run: LoadedRun, most: int | None = None) -> table.TableView:
     """Return the quality of each flight, or of at most so many, those that failed first."""
     feeds = not run.info.setup.computer_on_ground
-    columns = (
-        table.Column("#"),
-        table.Column("seed"),
-        table.Column("outcome", number=False),
-        table.Column("time", "s"),
-        table.Column("distance", "m"),
-        table.Column("energy", "kJ"),
-        table.Column("speed", "m/s"),
-        table.Column("top speed", "m/s", page_only=True),
-        *([table.Column("computer", "J", page_only=True)] if feeds else []),
-        table.Column("take-off", "s, kJ", page_only=True),
-        table.Column("battery", "%", page_only=True),
-        table.Column("why", number=False, page_only=True),
+    columns = table.columns_of(
+        "# | seed | <outcome | time [s] | distance [m] | energy [kJ] | speed [m/s] | "
+        f"*top speed [m/s]{' | *computer [J]' if feeds else ''} | *take-off [s, kJ] | "
+        "*battery [%] | *<why"
     )
     total = len(run.episodes)
     shown = run.episodes if most is None else failures_first(run.episodes, most)
@@ -155,14 +145,7 @@ def _kilojoules(joules: float | None) -> str:
 
 def quality_table(summary: RunSummary, *, computer: bool = True) -> table.TableView:
     """Return the flight quality with intervals; `computer` = its energy is the vehicle's."""
-    columns = (
-        table.Column("measure", number=False),
-        table.Column("value"),
-        table.Column("95 % interval"),
-        table.Column("median"),
-        table.Column("95 % interval", page_only=True),
-        table.Column("n"),
-    )
+    columns = table.columns_of("<measure | value | 95 % interval | median | *95 % interval | n")
     q = summary.quality
     rate = replace(SUCCESS_RATE, digits=rate_digits(q.success_rate))
     measures = [rate, FLIGHT_TIME, DISTANCE, ENERGY]
@@ -202,7 +185,7 @@ def _estimate_row(measure: Measure, mean: Estimate, median: Estimate) -> tuple[s
 
 def real_time_table(run: LoadedRun, summary: RunSummary) -> table.TableView:
     """Return real-time pace and the companion's resource use."""
-    columns = (table.Column("measure", number=False), table.Column("value"), table.Column("n"))
+    columns = table.columns_of("<measure | value | n")
     nothing: NDArray[np.int64] = np.zeros(0, np.int64)
     lateness = [stamps.get(TICK_LATENESS, nothing) for stamps in run.latency.values()]
     accepted = [stamps["accepted_us"] for stamps in run.latency.values() if "accepted_us" in stamps]
@@ -266,3 +249,96 @@ def _real_time_factor(run: LoadedRun) -> str:
         return "not paced"
     flown_us = sum(episode.ended_us - episode.started_us for episode in paced)
     return f"{flown_us / US_PER_S / wall_s:.3f} (asked {run.info.setup.speed:g})"
+
+
+ROWS = (
+    ("position, seen from above", "aside_m", "m"),
+    ("height", "height_m", "m"),
+    ("velocity", "velocity_m_s", "m/s"),
+    ("roll or pitch", "tilt_deg", "°"),
+    ("heading", "heading_deg", "°"),
+)
+
+
+def estimation_table(flights: Sequence[TrackedFlight]) -> table.TableView | None:
+    """Return the errors of the estimator in navigation; None where no flight recorded them."""
+    known = [(f.time_s >= 0.0, f.errors) for f in flights if f.errors is not None]
+    known = [(flies, errors) for flies, errors in known if flies.any()]
+    if not known:
+        return None
+    rows = []
+    for title, name, unit in ROWS:
+        values = np.concatenate([getattr(errors, name)[flies] for flies, errors in known])
+        figures = (np.median(values), np.percentile(values, 95.0), values.max())
+        rows.append((title, unit, *(f"{figure:.2f}" for figure in figures)))
+    columns = table.columns_of("<error of the estimate | <unit | median | p95 | greatest")
+    notes = (
+        f"Between what the flight controller believed and the true state, 50 times a second, "
+        f"{len(known):,} flights from the start of navigation.",
+    )
+    return table.TableView("estimation", "Estimator", columns, tuple(rows), notes)
+
+
+def run_ages(run: LoadedRun) -> CommandAges:
+    """Return the ages of a run's commands, from frame until the next command moves the motors."""
+    seen: list[NDArray[np.int64]] = [np.zeros(0, np.int64)]
+    flown, flight = list(seen), list(seen)
+    for number, stamps in sorted(run.latency.items()):
+        frames, motors = _acted(stamps)
+        seen.append(frames)
+        flown.append(motors)
+        flight.append(np.full(len(frames), number, np.int64))
+    return command_ages(np.concatenate(seen), np.concatenate(flown), np.concatenate(flight))
+
+
+def _acted(stamps: Mapping[str, NDArray[Any]]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return frame and motor time of the decisions of an episode that have both [µs]."""
+    nothing: NDArray[np.int64] = np.zeros(0, np.int64)
+    if "capture_us" not in stamps or "motor_us" not in stamps:
+        return nothing, nothing
+    frames, motors = stamps["capture_us"], stamps["motor_us"]
+    both = (frames != NO_STAMP) & (motors != NO_STAMP)
+    return frames[both].astype(np.int64), motors[both].astype(np.int64)
+
+
+def ages_table(ages: CommandAges, end_to_end: Summary) -> table.TableView | None:
+    """Return the age of the flown command beside its latency; None without consecutive commands."""
+    n = ages.youngest_us.size
+    if not n or not ages.time_us:
+        return None
+    columns = (*table.columns_of("<how old the flown command was"), *table.DURATION_COLUMNS)
+    rows = (
+        ("as it took effect, by decision", *table.duration_cells(end_to_end)),
+        (
+            "at any moment, by time",
+            f"{n:,}",
+            table.ms(ages.mean),
+            *(table.percentile_cell(ages.percentile(p), n) for p in (50.0, 90.0, 99.0)),
+            table.ms(float(ages.oldest_us.max())),
+        ),
+    )
+    notes = (
+        "A command ages until the next one moves the motors. By decision a stall is one sample, "
+        "however long it lasts; by time it weighs what the vehicle flew of it (coordinated "
+        "omission).",
+    )
+    return table.TableView("ages", "Age of the flown command", columns, rows, notes)
+
+
+MAX_LISTED = 60
+
+
+def faults_table(run: LoadedRun) -> table.TableView | None:
+    """Return the faults that acted, a line each; None where nothing failed."""
+    lines = [
+        (f"{e.index}", acted.fault, f"{from_s:.2f}", f"{to_s:.2f}", table.OUTCOME_LABELS[e.outcome])
+        for e in run.episodes
+        for acted, (from_s, to_s) in zip(e.faults, e.fault_spans_s(), strict=True)
+    ]
+    if not lines:
+        return None
+    notes = ["Simulated time since the start of navigation; negative: before it."]
+    if len(lines) > MAX_LISTED:
+        notes.append(f"{MAX_LISTED} of {len(lines):,} lines; all: {EPISODES_FILE}.")
+    columns = table.columns_of("# | <fault | from [s] | to [s] | <outcome of the flight")
+    return table.TableView("faults", "Faults", columns, tuple(lines[:MAX_LISTED]), tuple(notes))

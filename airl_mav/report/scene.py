@@ -11,6 +11,7 @@ from importlib.resources import files
 from typing import Any
 
 import numpy as np
+from matplotlib.colors import to_hex
 from numpy.typing import NDArray
 
 from airl_mav.arena.draw import GOAL_COLOUR, MOVING_COLOURS, START_COLOUR
@@ -26,7 +27,7 @@ from airl_mav.report.forensics.camera_view import headings
 from airl_mav.report.forensics.worst import flown_path
 from airl_mav.report.run_figures import OUTCOME_COLOURS, speed_colours
 from airl_mav.report.table import OUTCOME_LABELS
-from airl_mav.view.look import GLASS_OPACITY
+from airl_mav.view.style import GLASS_OPACITY
 
 POINTS = 240
 """A path has at most this many points: one a tenth of a second, or what is seen of more."""
@@ -74,14 +75,7 @@ def scene_json(
     everyone: Sequence[EpisodeRecord],
     fov_deg: float,
 ) -> str:
-    """Return all views as JSON for a script element.
-
-    Args:
-        run: The run, for the paths of `everyone`.
-        flights: Flights with a view each, in the order of the list.
-        everyone: Flights of the last, common view; omitted below two.
-        fov_deg: Horizontal field of view of the camera [deg]; 0 draws none.
-    """
+    """Return as JSON a view of each flight, and one of two or more of `everyone`."""
     top = top_speed(flights)
     views = [flight_view(flight, top, fov_deg) for flight in flights]
     if len(everyone) > 1:
@@ -137,7 +131,7 @@ def flight_view(flight: SceneFlight, top: float, fov_deg: float) -> dict[str, An
     up = goal_height_m(record.goal) or base + 0.1
     ring = _ring(east, north, record.goal_radius_m) + np.array([0.0, 0.0, base])
     speed_bar = {"title": {"text": "m/s"}, "thickness": 12, "len": 0.5, "x": 1.0}
-    scale = [[i / 15.0, _hex(speed_colours()(i / 15.0))] for i in range(16)]
+    scale = [[i / 15.0, to_hex(speed_colours()(i / 15.0))] for i in range(16)]
     traces += [
         _line(shadow, "#8d969f", "shadow", width=2),
         {
@@ -170,7 +164,7 @@ def flight_view(flight: SceneFlight, top: float, fov_deg: float) -> dict[str, An
             "marker": {"size": [0, 7, 0], "color": "#2f7fc4"},
         },
     ]
-    since_us = 0 if record.navigation_us is None else record.navigation_us - record.started_us
+    since_us = record.zero_us - record.started_us
     return {
         "figure": {"data": traces, "layout": _layout()},
         "path": {
@@ -220,11 +214,7 @@ def all_flights_view(
 
 
 def body_mesh(obstacles: Obstacles, i: int, center: Floats) -> tuple[Floats, NDArray[np.int64]]:
-    """Return obstacle i at a centre NED [m] as a closed mesh.
-
-    Returns:
-        Corners (n, 3), east, north, up [m], and triangles (m, 3).
-    """
+    """Return obstacle i at a centre NED as a closed mesh: corners ENU [m], triangles."""
     half, yaw = obstacles.half_size[i], float(obstacles.yaw[i])
     if obstacles.shape[i] == Shape.BOX:
         outline = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]]) * half[:2]
@@ -407,7 +397,3 @@ def _east_north_up(points: Floats) -> Floats:
 def _rounded(values: Floats) -> list[Any]:
     rounded: list[Any] = (np.round(values, 2) + 0.0).tolist()
     return rounded
-
-
-def _hex(colour: tuple[float, float, float, float]) -> str:
-    return "#" + "".join(f"{round(255.0 * channel):02x}" for channel in colour[:3])

@@ -12,7 +12,6 @@ from airl_mav.flight.record import EpisodeRecord
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report.depth_colours import palette
-from airl_mav.report.faults import fault_spans_s
 from airl_mav.report.flight_data import chosen, flight_data
 from airl_mav.report.forensics.evidence import Cause, ranked
 from airl_mav.report.forensics.worst import flown_path
@@ -149,7 +148,7 @@ def page_data(
                     range_m,
                     view.policy,
                 ),
-                "faults": fault_spans_s(flight.scene.record),
+                "faults": flight.scene.record.fault_spans_s(),
             }
             for flight in view.flights
         ],

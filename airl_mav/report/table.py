@@ -84,7 +84,16 @@ def percentile_cell(value_us: float | None, n: int) -> str:
     return TOO_FEW_CELL if value_us is None and n else ms(value_us)
 
 
-DURATION_COLUMNS = (Column("n"), *map(Column, ("mean", "p50", "p90", "p99", "max")))
+def columns_of(header: str) -> tuple[Column, ...]:
+    """Return columns by "title [unit] | ..."; "<" before a title: text, "*": `page_only`."""
+    columns = []
+    for title in header.split(" | "):
+        name, _, unit = title.lstrip("*<").removesuffix("]").partition(" [")
+        columns.append(Column(name, unit, "<" not in title[:2], title.startswith("*")))
+    return tuple(columns)
+
+
+DURATION_COLUMNS = columns_of("n | mean | p50 | p90 | p99 | max")
 
 
 def duration_cells(s: Summary) -> tuple[str, ...]:

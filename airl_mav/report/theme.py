@@ -89,7 +89,7 @@ class Picture:
         return width, height
 
     def data_uri(self) -> str:
-        """Return the SVG for an `img`."""
+        """Return the SVG for an `img` of a template."""
         return "data:image/svg+xml;base64," + base64.b64encode(self.svg.encode()).decode()
 
 
@@ -121,10 +121,7 @@ def _blank(width_in: float, height_in: float, layout: Literal["constrained"] | N
 def stacked_axes(
     rows: int, width_in: float, height_in: float, margins: Margins, **options: Any
 ) -> tuple[Figure, NDArray[np.object_]]:
-    """Return a figure with axes (rows,) that share x, of a size [inch]; `options` go to `subplots`.
-
-    Fixed margins: computing them from the texts would cost as much as drawing.
-    """
+    """Return a figure with axes that share x; fixed margins, as computing them is slow."""
     figure = _blank(width_in, height_in, None)
     axes = figure.subplots(rows, 1, sharex=True, squeeze=False, **options)[:, 0]
     for ax in axes:

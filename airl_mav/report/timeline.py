@@ -12,14 +12,21 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from airl_mav.core.constants import US_PER_MS, US_PER_S
-from airl_mav.latency.series import FENCE_RANGES, Fence, decision_series, fence
-from airl_mav.latency.stages import STAGES, Samples, Stage
+from airl_mav.latency.stages import (
+    FENCE_RANGES,
+    STAGES,
+    Fence,
+    Samples,
+    Stage,
+    decision_series,
+    fence,
+)
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report import theme
 from airl_mav.report.run_figures import long_tail
-from airl_mav.report.table import Column, TableView, ms
+from airl_mav.report.table import TableView, columns_of, ms
 
 TIMELINE_NAME = "latency-timeline"
 
@@ -42,7 +49,7 @@ SAW_DECISIONS = 16
 """With fewer decisions no saw is seen."""
 
 SAW_STEADY = 0.25
-"""Half of the decisions follow the one before within this share of the camera's period: what
+"""Half of the decisions follow the one before within this share of the camera's period. What
 scatters more has no saw."""
 
 OUTLIER_NOTE = (
@@ -76,9 +83,7 @@ class Timeline:
 
 def timeline_of(run: LoadedRun) -> Timeline:
     """Return the decisions of a run in the order of its flights."""
-    began = {
-        e.index: e.started_us if e.navigation_us is None else e.navigation_us for e in run.episodes
-    }
+    began = {episode.index: episode.zero_us for episode in run.episodes}
     flights = [i for i in sorted(began) if len(run.latency.get(i, {}).get("sent_us", ())) > 0]
     series = [decision_series(run.latency[i]) for i in flights]
     keys = decision_series({}).keys()
@@ -249,13 +254,8 @@ def slowest_table(
     beyond = beyond[np.argsort(-whole[beyond], kind="stable")[:SLOWEST]]
     parts = [s for s in STAGES if s in stages and s.key not in ("end_to_end", "t3")]
     rows = tuple(_slow_row(timeline, int(k), median, parts) for k in beyond)
-    columns = (
-        Column("flight"),
-        Column("at", "s"),
-        Column("end to end", "ms"),
-        Column("times the median"),
-        Column("longest part", number=False),
-        Column("of it", "ms"),
+    columns = columns_of(
+        "flight | at [s] | end to end [ms] | times the median | <longest part | of it [ms]"
     )
     notes = (
         f"{limit.beyond:,} of {limit.n:,} decisions above {ms(limit.limit_us)} ms; "

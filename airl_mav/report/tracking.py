@@ -56,7 +56,7 @@ COMMANDED: Mapping[str, tuple[str, ...]] = {
     ATTITUDE: ("roll_deg", "pitch_deg", "heading_deg", "thrust"),
     RATES: ("body_roll_rate_deg_s", "body_pitch_rate_deg_s", "body_yaw_rate_deg_s", "thrust"),
 }
-"""The four numbers of a setpoint by the column that they stand in: named as the fields of `Motion`,
+"""The four numbers of a setpoint by the column that they stand in. Named as the fields of `Motion`,
 and the thrust; what has no name is not shown. What ends with _deg or _deg_s is recorded in rad."""
 
 
@@ -112,9 +112,8 @@ def track(run: LoadedRun, record: EpisodeRecord) -> TrackedFlight | None:
     if path is None or len(path) < 2:
         return None
     stamps = run.latency.get(record.index, {})
-    zero_us = record.started_us if record.navigation_us is None else record.navigation_us
     flown, heading = _motion(path.time_us, path.position, path.velocity, path.quaternion)
-    commands, pilot = commands_of(stamps, zero_us), run.info.config.get("pilot", {})
+    commands, pilot = commands_of(stamps, record.zero_us), run.info.config.get("pilot", {})
     if "heading_deg" in commands.values:
         flown = replace(flown, heading_deg=np.degrees(np.angle(np.exp(1j * heading))))
     elif "body_roll_rate_deg_s" in commands.values:
@@ -128,7 +127,7 @@ def track(run: LoadedRun, record: EpisodeRecord) -> TrackedFlight | None:
         errors = _errors(path, flown, heading, believed, estimated, estimated_heading)
     return TrackedFlight(
         record=record,
-        time_s=(path.time_us - zero_us) / US_PER_S,
+        time_s=(path.time_us - record.zero_us) / US_PER_S,
         flown=flown,
         estimated=estimated,
         errors=errors,

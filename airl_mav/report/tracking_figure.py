@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from airl_mav.report import theme
 from airl_mav.report.depth_colours import pictured
-from airl_mav.report.faults import fault_spans_s
 from airl_mav.report.policy_view import SeenDecision
 from airl_mav.report.tracking import Commands, Floats, TrackedFlight
 
@@ -154,7 +153,7 @@ def _draw_row(
     ax.margins(y=0.08)
     if t[keep[0]] < 0.0:
         ax.axvspan(t[keep[0]], 0.0, color=theme.RULE, alpha=0.45, lw=0)
-    for begin_s, end_s in fault_spans_s(flight.record):
+    for begin_s, end_s in flight.record.fault_spans_s():
         ax.axvspan(begin_s, end_s, color=theme.MARK, alpha=0.12, lw=0)
     theme.plain_axes(ax)
     ax.locator_params(axis="y", nbins=4)

@@ -17,10 +17,9 @@ from pydantic import TypeAdapter
 from airl_mav.core.errors import EXIT_INVALID, EXIT_NOT_MET, EXIT_UNDECIDED
 from airl_mav.core.files import read_typed, replace_file, write_json
 from airl_mav.flight.paired import PairedComparison
-from airl_mav.flight.record import EpisodeRecord
+from airl_mav.flight.record import EpisodeRecord, Setup
 from airl_mav.flight.requirements import Finding, Requirement, find
 from airl_mav.flight.sequential import Decision
-from airl_mav.flight.setup import Setup
 from airl_mav.flight.statistics import Aggregate, Estimate
 from airl_mav.rehearsal.run_folder import RunInfo
 from airl_mav.report.document import environment
@@ -107,19 +106,7 @@ def judge_run(
     against: PairedComparison | None = None,
     reference: str = "",
 ) -> OverallVerdict:
-    """Return the verdict of a run.
-
-    Args:
-        setup: Policy, vehicle and computer.
-        quality: Aggregated figures.
-        episodes: The flights.
-        requirements: Requirements to check.
-        against: Comparison with a reference on the same seeds; None = none.
-        reference: Name of the reference.
-
-    Raises:
-        FieldError: A gap is required without a reference.
-    """
+    """Return the verdict of a run; FieldError if a gap is required without a reference."""
     computer = Path(setup.computer.name).stem
     rate = quality.success_rate
     reached = "no flight was finished"

@@ -15,8 +15,7 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.constants import Level
 from airl_mav.core.goals import Goal
 from airl_mav.flight.judge import Task
-from airl_mav.flight.record import EpisodeRecord
-from airl_mav.flight.setup import BUILT_IN, Part, Setup
+from airl_mav.flight.record import BUILT_IN, EpisodeRecord, Part, Setup
 from airl_mav.latency.injection import Injection
 from airl_mav.latency.samplers import FixedSampler, LatencySampler, latency_generator
 from airl_mav.policy.actions import Policy

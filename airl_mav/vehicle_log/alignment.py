@@ -1,13 +1,13 @@
-"""The clocks of a companion and a flight controller, by what both have recorded of one flight.
+"""The clocks of a companion and a flight controller, by their recordings of one flight.
 
-Down: velocity and attitude that telemetry told are those of the log, later. The shift at which both
-agree best is the offset of the clocks plus the age of what was told: the time on the link, and that
-of the newest message. Up: a setpoint appears in the log between two samples, so each one that was
-sent bounds the offset and the time that it took; the shift that the most of these bounds contain is
-taken, as by Marzullo's algorithm (K. Marzullo, Maintaining the time in a distributed system, 1984).
+Down: velocity and attitude of telemetry are those of the log, later. The shift at which both agree
+best is the offset of the clocks plus the age of telemetry. That is the time on the link, and that
+of the newest message. Up: a setpoint appears in the log between two samples. So each one bounds the
+offset plus its delay. The shift within most of these bounds is taken, as by Marzullo's algorithm
+(K. Marzullo, Maintaining the time in a distributed system, 1984).
 
-Neither alone tells the offset from the time on the link. Their sum is free of the offset: the round
-trip, from a setpoint that is sent to telemetry that could tell of it.
+Neither alone tells the offset from the time on the link. Their sum is free of the offset. It is the
+round trip, from a setpoint that is sent to telemetry that could tell of it.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ SAME_SPEED_M_S, SAME_RATE_RAD_S = 0.02, 0.01
 
 SAME_TURN, SAME_THRUST = 0.001, 0.001
 """Body rates [rad/s], the numbers of `_down_and_nose` and thrusts are the same when they differ by
-less: nothing shapes them on their way, as a yaw rate is shaped."""
+less. Nothing shapes them on their way, as a yaw rate is shaped."""
 
 LONGEST_LINK_US = US_PER_S
 """Longest time that a setpoint takes [µs]."""
@@ -82,18 +82,7 @@ def align(
     setpoints: NDArray[np.float64],
     commands: CommandKind = "velocity",
 ) -> Alignment:
-    """Return the relation of the clocks of a recorded flight and of its vehicle's log.
-
-    Args:
-        path: Telemetry, by the companion's clock.
-        log: The flight controller's log.
-        sent_us: (k,) times at which the companion sent setpoints [µs].
-        setpoints: (k, 4) forward, right, down [m/s], yaw rate [rad/s]; or as `commands` has them.
-        commands: Kind of the setpoints.
-
-    Raises:
-        UsageError: The log is of another flight, or nothing moved.
-    """
+    """Return how a recorded flight's clock and its vehicle's log relate, or raise UsageError."""
     told_us = _refined(path, log, _coarse(path, log))
     flown, logged = path.velocity[:, :2], log.motion.at(path.time_us - told_us)[:, 3:5]
     inside = _inside(path, log, told_us)
@@ -232,11 +221,7 @@ def _bounds(
     seen: Series,
     near: NDArray[np.float64],
 ) -> list[tuple[float, float]]:
-    """Return the interval after the expected time [µs] in which each setpoint appears in the log.
-
-    `expected_us` (k,) are the times without any delay, `sent` (k, m) the setpoints, `near` (m,) the
-    tolerances of equality.
-    """
+    """Return when after the expected times (k,) each setpoint appears in the log, as intervals."""
     bounds = []
     for k in range(1, len(sent)):
         if (np.abs(sent[k] - sent[k - 1]) < 2.0 * near).all():

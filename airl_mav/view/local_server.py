@@ -1,7 +1,7 @@
 """viser's server restricted to pages of this computer.
 
 Any web page may open a WebSocket to 127.0.0.1, with its `Origin`. viser accepts all of them and
-opens public tunnels on request: a foreign page could change flights or publish them.
+opens public tunnels on request. A foreign page could change flights or publish them.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Messages from a flight to its view, and their bytes on the wire.
 
 Positions and velocities are local NED [m, m/s], attitudes body FRD -> NED [w, x, y, z], times
-simulated [µs]. A message is one part of JSON; an image follows as a second part: little-endian
+simulated [µs]. A message is one part of JSON. An image follows as a second part: little-endian
 uint16 millimetres of depth, or bytes of colour.
 """
 

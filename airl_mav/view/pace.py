@@ -1,6 +1,6 @@
 """Pace of a lockstep flight by its viewers: speed, pause, single steps.
 
-Only wall time passes here; the flight stays bit-identical.
+Only wall time passes here. The flight stays bit-identical.
 """
 
 from __future__ import annotations

@@ -16,28 +16,7 @@ from airl_mav.arena.triangles import drawn, standing
 from airl_mav.core import frames
 from airl_mav.core.goals import goal_height_m
 from airl_mav.profiles.vehicle import CORNERS, COUNTER_CLOCKWISE
-from airl_mav.view.look import (
-    BLADE,
-    COMMANDED,
-    DROP,
-    FIRST,
-    FLOOR,
-    FLOWN,
-    GLASS_OPACITY,
-    GOAL,
-    GRID,
-    HILLS,
-    MOVING,
-    NOSE,
-    OPEN,
-    SECTION,
-    START,
-    WALL_OPACITY,
-    Look,
-    arrow,
-    segments_of,
-    walls,
-)
+from airl_mav.view import style
 from airl_mav.view.messages import Episode, Vehicle, VehicleShape
 from airl_mav.view.pictures import camera_picture
 from airl_mav.view.shown import Shown
@@ -73,7 +52,7 @@ class FlightScene:
     """The scene of one server. All calls come from one thread."""
 
     def __init__(
-        self, server: viser.ViserServer, root: str = "/flight", look: Look = FIRST
+        self, server: viser.ViserServer, root: str = "/flight", look: style.Look = style.FIRST
     ) -> None:
         """Prepare an empty scene; all its nodes lie below `root`."""
         self._server = server
@@ -109,7 +88,7 @@ class FlightScene:
 
     def _add(self, kind: str, name: str, *args: Any, **properties: Any) -> Any:
         if kind == "box":
-            # Its corners have a normal for each side: it looks the same, and a page without a GPU
+            # Its corners have a normal for each side. It looks the same, and a page without a GPU
             # has one shader fewer to compile before it shows anything.
             properties["flat_shading"] = False
         return getattr(self._scene, f"add_{kind}")(f"{self._root}{name}", *args, **properties)
@@ -142,7 +121,7 @@ class FlightScene:
 
     def _surround(self, episode: Episode, arena: Arena | None) -> None:
         if self._look.whole:
-            bounds = OPEN if arena is None else arena.bounds
+            bounds = style.OPEN if arena is None else arena.bounds
             self._build_floor(bounds)
             self._build_ends(episode, 0.6 * bounds.height, _below(arena, episode.goal))
             if arena is not None:
@@ -153,10 +132,10 @@ class FlightScene:
         none = np.zeros((0, 2, 3), np.float32)
         # At the vehicle's place, by a message of the same kind: they move with it, not behind it.
         self._place = self._add("frame", "/place", show_axes=False)
-        self._drop = self._add("line_segments", "/place/drop", none, DROP, thickness=0.015)
+        self._drop = self._add("line_segments", "/place/drop", none, style.DROP, thickness=0.015)
         sizes = {"shaft_radius": 0.025, "head_radius": 0.07, "head_length": 0.16}
-        self._flown = self._add("arrows", "/place/flown", none, FLOWN, **sizes)
-        self._commanded = self._add("arrows", "/place/commanded", none, COMMANDED, **sizes)
+        self._flown = self._add("arrows", "/place/flown", none, style.FLOWN, **sizes)
+        self._commanded = self._add("arrows", "/place/commanded", none, style.COMMANDED, **sizes)
 
     def _build_floor(self, b: Bounds) -> None:
         length, width = b.north_max - b.north_min, b.east_max - b.east_min
@@ -168,9 +147,9 @@ class FlightScene:
             plane="xy",
             cell_size=1.0,
             section_size=5.0,
-            cell_color=GRID,
-            section_color=SECTION,
-            plane_color=FLOOR,
+            cell_color=style.GRID,
+            section_color=style.SECTION,
+            plane_color=style.FLOOR,
             plane_opacity=1.0,
             fade_distance=400.0,
             position=(*middle, 0.0),
@@ -179,91 +158,49 @@ class FlightScene:
         )
 
     def _build_arena(self, arena: Arena) -> None:
-        corners, faces = walls(arena.bounds)
+        # From outside nobody looks through them.
+        look = {"color": arena.wall_colour, "opacity": style.WALL_OPACITY, "side": "front"}
         self._add(
-            "mesh_simple",
-            "/arena/walls",
-            *(corners, faces),
-            color=arena.wall_colour,
-            opacity=WALL_OPACITY,
-            # From outside nobody looks through them.
-            side="front",
-            flat_shading=True,
+            "mesh_simple", "/arena/walls", *style.walls(arena.bounds), **look, flat_shading=True
         )
         if arena.ground is not None:
-            self._add(
-                "mesh_simple",
-                "/arena/ground",
-                arena.ground.points.astype(np.float32),
-                arena.ground.faces.astype(np.uint32),
-                color=HILLS,
-                side="double",
-                flat_shading=True,
-            )
+            self._add_surface("/arena/ground", arena.ground.points, arena.ground.faces, style.HILLS)
         shown = drawn(arena.meshes)
         for each in shown:
-            places, triangles = standing(each)
-            self._add(
-                "mesh_simple",
-                f"/arena/mesh/{each.first}",
-                *(places.astype(np.float32), triangles.astype(np.uint32)),
-                color=arena.look.finish.colour(OBSTACLE + each.first),
-                side="double",
-                flat_shading=True,
-            )
+            colour = arena.look.finish.colour(OBSTACLE + each.first)
+            self._add_surface(f"/arena/mesh/{each.first}", *standing(each), colour)
         for i in range(len(arena.obstacles)):
             if arena.mesh_of(i) in shown:
                 continue
             moves = i >= arena.n_static
-            colour = MOVING if moves else arena.look.finish.colour(OBSTACLE + i)
+            colour = style.MOVING if moves else arena.look.finish.colour(OBSTACLE + i)
             glass = arena.clear is not None and bool(arena.clear[i])
-            node = self._obstacle(arena, i, colour, GLASS_OPACITY if glass else None)
+            node = self._obstacle(arena, i, colour, style.GLASS_OPACITY if glass else None)
             if moves:
                 self._movers.append(node)
 
+    def _add_surface(
+        self, name: str, places: Floats, faces: NDArray[np.int32], colour: style.Colour
+    ) -> None:
+        mesh = places.astype(np.float32), faces.astype(np.uint32)
+        self._add("mesh_simple", name, *mesh, color=colour, side="double", flat_shading=True)
+
     def _build_ends(self, episode: Episode, height: float, base: float) -> None:
-        goal = episode.goal[:2]
+        (north, east), green = episode.goal[:2], {"color": style.GOAL}
+        within = {"radius": episode.goal_radius_m, **green}
         if (height_m := goal_height_m(episode.goal)) is not None:
             height = height_m - base
-            self._add(
-                "icosphere",
-                "/goal/ball",
-                radius=episode.goal_radius_m,
-                color=GOAL,
-                opacity=0.3,
-                position=episode.goal,
-            )
-        self._add(
-            "cylinder",
-            "/goal/disc",
-            radius=episode.goal_radius_m,
-            height=0.04,
-            color=GOAL,
-            opacity=0.45,
-            position=(*goal, -base - 0.03),
-        )
-        self._add(
-            "cylinder",
-            "/goal/pole",
-            radius=0.04,
-            height=height,
-            color=GOAL,
-            position=(*goal, -base - 0.5 * height),
-        )
-        self._add("label", "/goal/label", "goal", position=(*goal, -base - height - 0.2))
-        self._add(
-            "cylinder",
-            "/start",
-            radius=0.4,
-            height=0.03,
-            color=START,
-            opacity=0.5,
-            position=(0.0, 0.0, -0.02),
-        )
+            self._add("icosphere", "/goal/ball", **within, opacity=0.3, position=episode.goal)
+        at = (north, east, -base - 0.03)
+        self._add("cylinder", "/goal/disc", **within, height=0.04, opacity=0.45, position=at)
+        at = (north, east, -base - 0.5 * height)
+        self._add("cylinder", "/goal/pole", **green, radius=0.04, height=height, position=at)
+        at = (north, east, -base - height - 0.2)
+        self._add("label", "/goal/label", "goal", position=at)
+        disc = {"radius": 0.4, "height": 0.03, "color": style.START, "opacity": 0.5}
+        self._add("cylinder", "/start", **disc, position=(0.0, 0.0, -0.02))
 
-    def _obstacle(
-        self, arena: Arena, i: int, colour: tuple[int, int, int], opacity: float | None
-    ) -> Any:
+    def _obstacle(self, arena: Arena, i: int, colour: style.Colour, opacity: float | None) -> Any:
         half, at = arena.obstacles.half_size[i].tolist(), tuple(arena.obstacles.center[i].tolist())
         name = f"/arena/obstacle/{i}"
         if arena.obstacles.shape[i] == Shape.BOX:
@@ -281,27 +218,14 @@ class FlightScene:
         forward, right, radius = shape.arm_forward_m, shape.arm_right_m, shape.rotor_radius_m
         height = max(0.04, 0.5 * shape.height_m)
         size = 0.45 * min(forward, right)
-        self._add(
-            "box",
-            "/vehicle/body",
-            color=self._look.body,
-            dimensions=(3.4 * size, 2.2 * size, height),
-        )
-        self._add(
-            "box",
-            "/vehicle/nose",
-            color=NOSE,
-            dimensions=(0.9 * size, 1.0 * size, 0.6 * height),
-            position=(2.0 * size, 0.0, 0.0),
-        )
+        body = {"color": self._look.body, "dimensions": (3.4 * size, 2.2 * size, height)}
+        self._add("box", "/vehicle/body", **body)
+        nose = {"color": style.NOSE, "dimensions": (0.9 * size, 1.0 * size, 0.6 * height)}
+        self._add("box", "/vehicle/nose", **nose, position=(2.0 * size, 0.0, 0.0))
+        arm = {**body, "dimensions": (2.0 * math.hypot(forward, right), 0.025, 0.02)}
         for name, side in (("right", 1.0), ("left", -1.0)):
-            self._add(
-                "box",
-                f"/vehicle/arm/{name}",
-                color=self._look.body,
-                dimensions=(2.0 * math.hypot(forward, right), 0.025, 0.02),
-                wxyz=frames.quat_from_euler(0.0, 0.0, math.atan2(side * right, forward)),
-            )
+            turn = frames.quat_from_euler(0.0, 0.0, math.atan2(side * right, forward))
+            self._add("box", f"/vehicle/arm/{name}", **arm, wxyz=turn)
         for corner in CORNERS:
             at = (
                 forward if corner.startswith("front") else -forward,
@@ -311,7 +235,7 @@ class FlightScene:
             name = f"/vehicle/rotor/{corner.replace(' ', '-')}"
             disc = {"radius": radius, "height": 0.006, "color": self._look.disc, "opacity": 0.5}
             self._add("cylinder", f"{name}/disc", position=at, **disc)
-            blade = {"dimensions": (2.0 * radius, 0.12 * radius, 0.008), "color": BLADE}
+            blade = {"dimensions": (2.0 * radius, 0.12 * radius, 0.008), "color": style.BLADE}
             self._blades.append(self._add("box", f"{name}/blade", position=at, **blade))
         if self._look.whole:
             self._build_camera(shape)
@@ -340,7 +264,7 @@ class FlightScene:
             aspect=shape.camera_aspect,
             scale=FRUSTUM_M,
             thickness=0.012,
-            color=FLOWN,
+            color=style.FLOWN,
             position=(shape.camera_forward_m, shape.camera_right_m, -shape.camera_up_m),
             wxyz=frames.quat_multiply(turn, frames.FRD_FROM_OPTICAL),
         )
@@ -360,11 +284,11 @@ class FlightScene:
                 node.position = center
         above = -at[2] - _below(shown.arena, vehicle.position)
         self._drop.points = np.array([[[0.0, 0.0, 0.0], [0.0, 0.0, above]]], np.float32)
-        self._flown.points = arrow(np.array(vehicle.velocity))
+        self._flown.points = style.arrow(np.array(vehicle.velocity))
         command = shown.command if self._look.whole else None
         if command is not None:
             command = frames.heading_to_ned(command, frames.quat_yaw(np.array(vehicle.quaternion)))
-        self._commanded.points = arrow(command)
+        self._commanded.points = style.arrow(command)
         self._extend_trail(shown.trail)
 
     def _extend_trail(self, trail: list[tuple[float, float, float]]) -> None:
@@ -373,7 +297,7 @@ class FlightScene:
             return
         self._trail_points = len(trail)
         for part in range(max(0, len(self._trail) - 1), (len(trail) - 2) // CHUNK + 1):
-            segments = segments_of(trail[part * CHUNK : (part + 1) * CHUNK + 1])
+            segments = style.segments_of(trail[part * CHUNK : (part + 1) * CHUNK + 1])
             if part == len(self._trail):
                 name = f"/trail/{part}"
                 self._trail.append(

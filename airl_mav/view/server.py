@@ -39,11 +39,7 @@ FIRST_MS = 400
 
 
 class Controls:
-    """The controls of one page.
-
-    Callbacks are coroutines, which run before the page's next message; functions would run in a
-    pool and read a later state of the control.
-    """
+    """The controls of one page; callbacks are coroutines, which run before its next message."""
 
     def __init__(self, gui: Any, steering: Steering) -> None:
         """Take viser's interface, and what is asked for at the beginning."""

@@ -35,10 +35,7 @@ class Hand:
         self._as_asked = compensate
 
     def t2_us(self) -> int | None:
-        """Return the viewer's latency for the next decision [µs]; None = the scenario's.
-
-        Called once per decision, before its simulated time begins.
-        """
+        """Return the viewer's latency for the next decision [µs]; None = the scenario's."""
         self._known = self._newest()
         t2_ms = self._known.t2_ms
         if t2_ms is None:

@@ -41,12 +41,7 @@ class Viewer:
     """A page that shows flights, until it is closed."""
 
     def __init__(self, request: Request) -> None:
-        """Start the viewer and wait until it serves.
-
-        Raises:
-            FieldError: The port is taken.
-            ViewError: Its process does not start.
-        """
+        """Start the viewer and wait for it; FieldError: the port is taken."""
         self._folder = tempfile.TemporaryDirectory(prefix="airl-view-")
         self._child = ChildProcess(
             [sys.executable, "-m", MODULE],

@@ -1,1 +1,1 @@
-"""Depth cameras on the aircraft: what a driver is, how its images become frames, and drivers."""
+"""Depth cameras on the aircraft: interface of drivers, conversion into frames, and drivers."""

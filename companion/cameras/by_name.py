@@ -49,19 +49,13 @@ def open_named_camera(
     whose: str,
     further: Mapping[str, Intrinsics] | None = None,
 ) -> OpenCamera:
-    """Open a camera by its name.
+    """Open a camera by its name, or raise FieldError if it is missing, sees too little or no depth.
 
-    Args:
-        name: tcp://HOST:PORT or ipc://PATH; "realsense", "realsense:SERIAL" or
-            "realsense:FILE.bag"; "oak-d" or "oak-d:DEVICE"; "ros2:/TOPIC"; "rosbag:PATH" or
-            "rosbag:PATH:/TOPIC"; FILE.py:NAME, MODULE:NAME or the entry point of a driver.
-        clock: The companion's, for the stamps.
-        wanted: Target of a driver's images; an address is used as it is.
-        whose: Owner of `wanted`: "vehicle quad".
-        further: Targets of a driver's additional images, by name.
-
-    Raises:
-        FieldError: No such camera, it sees too little, or depth instead of colour.
+    Names are tcp://HOST:PORT or ipc://PATH, used as they are; "realsense", "realsense:SERIAL" or
+    "realsense:FILE.bag"; "oak-d" or "oak-d:DEVICE"; "ros2:/TOPIC"; "rosbag:PATH" or
+    "rosbag:PATH:/TOPIC"; FILE.py:NAME, MODULE:NAME or the entry point of a driver. Images become
+    those that are `wanted` by their owner, `whose`: "vehicle quad"; a driver's additional ones, by
+    name, fit `further`.
     """
     if "://" in name:
         return open_camera(name, clock)

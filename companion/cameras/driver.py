@@ -102,15 +102,7 @@ class CameraThread:
         fitting: Fitting,
         further: Mapping[str, Fitting] | None = None,
     ) -> None:
-        """Start to read a driver, which `close` closes.
-
-        Args:
-            name: Name in messages.
-            camera: The driver.
-            clock: The companion's, for the stamps.
-            fitting: Conversion into the policy's images.
-            further: The same of additional images, by name; others are left out.
-        """
+        """Start to read a driver, which `close` closes; images without a fitting are left out."""
         self.failure: str | None = None
         """Why no more images come, once the driver has raised."""
         self.dropped = 0

@@ -1,9 +1,9 @@
 """Makes a camera's images those of the vehicle profile's camera, with which policies are trained.
 
 The profile's camera has few pixels, in the middle of what a real one sees. Each of its pixels is
-looked up in the camera's image at the points of a grid, and the nearest return of them wins: the
-function with which the shipped layouts shrink an image for the network, so a thin obstacle is not
-lost, and a hole of the stereo matcher is "no return" only where all points are.
+looked up in the camera's image at the points of a grid, and the nearest return of them wins. The
+function with which the shipped layouts shrink an image for the network. So a thin obstacle is not
+lost. A hole of the stereo matcher is "no return" only where all points are.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class Lens:
 
 
 class Fitting:
-    """From the images of one camera to those of another that looks the same way."""
+    """From the images of one camera to another that looks the same way."""
 
     def __init__(self, lens: Lens, wanted: Intrinsics) -> None:
         """Find where each pixel of the wanted camera lies in the images of the lens."""
@@ -102,11 +102,7 @@ class Fitting:
             self._deeper = deeper.astype(np.float32)
 
     def fit(self, depth_mm: NDArray[np.uint16]) -> NDArray[np.uint16]:
-        """Return the target image (height, width) [mm] of a lens's Z16 image; 0 = no return.
-
-        Raises:
-            ValueError: An image of another size or type.
-        """
+        """Return the target image (height, width) [mm] of a lens's Z16 image; 0 = no return."""
         if depth_mm.shape != self._shape or depth_mm.dtype != np.uint16:
             raise ValueError(
                 f"an image of {depth_mm.dtype} {depth_mm.shape}; accepted: uint16 {self._shape}"
@@ -168,10 +164,7 @@ def _places(
     lens_centre: float,
     points: int,
 ) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Return the nearest lens pixel of each point along an axis (size x points,), and misses.
-
-    For a pinhole in a pinhole, where rows and columns are separable.
-    """
+    """Return the nearest lens pixels along an axis of a pinhole (size x points,), and misses."""
     at = (np.arange(size * points) + 0.5) / points - 0.5
     place = np.rint(lens_centre + lens_focal * (at - centre) / focal).astype(np.intp)
     return np.clip(place, 0, lens_size - 1), (place < 0) | (place >= lens_size)

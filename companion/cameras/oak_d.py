@@ -1,7 +1,7 @@
 """Luxonis OAK-D stereo cameras, through depthai (the extra `oak`).
 
-The camera matches on its own, as in the profile `quad-oak-d`: 640 x 400 pixels, disparities up to
-95 px in steps of an eighth.
+The camera matches on its own, as in the profile `quad-oak-d`. Images have 640 x 400 pixels,
+disparities up to 95 px in steps of an eighth.
 """
 
 from __future__ import annotations
@@ -45,16 +45,11 @@ class OakD:
         depth: Any,
         now: Callable[[], timedelta] | None = None,
     ) -> None:
-        """Start a pipeline, and wait for its first image, which describes the lens.
+        """Start a `depthai.Pipeline`, and wait for its first image, which describes the lens.
 
-        Args:
-            name: Name in messages.
-            pipeline: `depthai.Pipeline` of a device or of host nodes; stopped by `close`.
-            depth: Its rectified depth output (`depthai.Node.Output`): RAW16 [mm], 0 = no return.
-            now: Monotonic host time of depthai's stamps; None: depthai's clock.
-
-        Raises:
-            FieldError: No image comes, or the first one is without intrinsics or no depth image.
+        `close` stops the pipeline. `depth` is its rectified output: RAW16 [mm], 0 = no return;
+        `now` the monotonic host time of depthai's stamps. Raises FieldError if no image comes, or
+        the first one is without intrinsics or no depth image.
         """
         self._pipeline, self._silence = pipeline, Silence()
         self._now: Callable[..., timedelta] = dai.Clock.now if now is None else now
@@ -108,10 +103,7 @@ class OakD:
 
 
 def _lens_of(frame: Any) -> Lens:
-    """Return the lens of an image as depthai's own point-cloud nodes use it, or raise ValueError.
-
-    Intrinsics follow the image through rectification and scaling; rectified images are undistorted.
-    """
+    """Return an image's lens, as depthai's point-cloud nodes use it, or raise ValueError."""
     about = frame.getTransformation()
     if not about.isValid():
         raise ValueError("its images come without intrinsics: the device is not calibrated")
@@ -131,14 +123,10 @@ def _checked(frame: Any) -> Any:
 
 
 def open_oak_d(which: str) -> OakD:
-    """Open a camera, and start to match.
+    """Open a camera, and start to match, or raise FieldError.
 
-    Args:
-        which: "" for the first camera; a device id, as `depthai` lists it; or a network address
-            (PoE), which need not be in the list.
-
-    Raises:
-        FieldError: No such camera, in use, not a stereo camera, or no depth images.
+    "" is the first camera; others are a device id, as `depthai` lists it, or a network address
+    (PoE), which need not be in the list.
     """
     name = f"oak-d:{which}" if which else "oak-d"
     found = [each.getDeviceId() for each in dai.Device.getAllAvailableDevices()]

@@ -29,10 +29,7 @@ class RealSense:
     """The depth stream of one device. Implements `driver.DepthCamera`."""
 
     def __init__(self, device: Any, utc_now_us: Callable[[], int] = utc_us) -> None:
-        """Start the depth stream of a `pyrealsense2.device`, or raise FieldError.
-
-        `utc_now_us` is the host's calendar time [µs], by which librealsense stamps images.
-        """
+        """Start the depth stream of a `pyrealsense2.device`, or raise FieldError."""
         self._device, self._utc_now_us = device, utc_now_us
         self._sensor, profile = _depth_stream(device)
         k = profile.as_video_stream_profile().intrinsics
@@ -75,11 +72,7 @@ class RealSense:
 
 
 def open_realsense(which: str) -> RealSense:
-    """Open a camera or a recording, or raise FieldError.
-
-    Args:
-        which: "" for the first camera; a serial number; or a path that ends in .bag or .db3.
-    """
+    """Open the first camera, a serial number, or a .bag or .db3 file; FieldError: none."""
     context = rs.context()
     if which.endswith(RECORDINGS):
         if not Path(which).is_file():

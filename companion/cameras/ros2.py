@@ -129,10 +129,7 @@ class Ros2Camera:
     """An image topic and its camera_info. Implements `driver.DepthCamera`."""
 
     def __init__(self, topic: str, utc_now_us: Callable[[], int] = utc_us) -> None:
-        """Subscribe to depth images, and wait for the camera's description, or raise FieldError.
-
-        `utc_now_us` is the host's calendar time [µs], by which ROS stamps images.
-        """
+        """Subscribe to depth images, and wait for the camera's description, or raise FieldError."""
         self._utc_now_us, self._silence = utc_now_us, Silence()
         self._participant = _participant()
         described = info_topic(topic)

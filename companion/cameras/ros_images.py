@@ -22,12 +22,10 @@ MILLIMETRES, METRES = ("16UC1", "mono16"), ("32FC1",)
 
 
 def depth_mm(message: Any) -> NDArray[np.uint16]:
-    """Return the depth image (height, width) of a sensor_msgs/Image [mm]; 0 = no return.
+    """Return the depth image (height, width) of a sensor_msgs/Image [mm], or raise ValueError.
 
-    In metres, NaN, infinity and non-positive values are no return (ROS Enhancement Proposal 117).
-
-    Raises:
-        ValueError: The message holds no depth image, or not the bytes that it announces.
+    0 is no return. In metres, NaN, infinity and non-positive values are no return (ROS
+    Enhancement Proposal 117).
     """
     if message.encoding not in (*MILLIMETRES, *METRES):
         raise ValueError(
@@ -72,14 +70,12 @@ RECTIFIED = "rect"
 
 
 def lens_of(message: Any, image_topic: str = "") -> Lens:
-    """Return the lens that a sensor_msgs/CameraInfo describes.
+    """Return the lens that a sensor_msgs/CameraInfo describes, or raise ValueError.
 
     Without distortion K describes the camera. With distortion P does, for the rectified images that
     drivers subscribe to. Images of the model `equidistant` (fisheye) are used unrectified with K
-    and D, unless the last part of their topic says that they are rectified.
-
-    Raises:
-        ValueError: It describes neither pinhole nor fisheye, or images that are binned or cropped.
+    and D, unless the last part of their topic says that they are rectified. Images that are binned
+    or cropped are not described.
     """
     roi = message.roi
     cropped = (roi.width, roi.height) not in ((0, 0), (message.width, message.height))

@@ -4,23 +4,34 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
-
-import numpy as np
+from typing import Any, NamedTuple
 
 from airl_mav.core.constants import US_PER_S
-from airl_mav.core.frames import Geodetic, Vector, quat_from_euler
-from airl_mav.core.location import MAGNETIC_DECLINATION
+from airl_mav.core.frames import (
+    Geodetic,
+    Vector,
+    local_to_geodetic,
+    quat_from_euler,
+)
+from airl_mav.core.kernels import kernel
+from airl_mav.core.location import HOME, MAGNETIC_DECLINATION
 from airl_mav.vehicle.atmosphere import altitude_m
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.magnetic_field import FieldCheck
+from firmware_sim.engine.record import GPS, MAG, PRESSURE, Record
 from firmware_sim.interfaces import SensorSample
 
-ALIGN_S = 0.5
-"""Time at rest over which attitude and barometer are averaged at start [s]."""
+ALIGN_US = US_PER_S // 2
+"""Time at rest over which attitude and barometer are averaged at start [µs]."""
 
-LONGEST_ALIGN_S = 10.0
-"""Samples at rest that are older are forgotten while a sensor is waited for [s]."""
+LONGEST_ALIGN_US = 10 * US_PER_S
+"""Averaging begins anew when a sensor has been waited for so long [µs]."""
+
+IMU, COMPASS, BAROMETER, FIXES = range(4)
+"""Places in `rest_count`."""
+
+_ACCEL, _FIELD, _ALTITUDE, _PLACE = slice(0, 3), slice(3, 6), 6, slice(7, 10)
+"""Places in `rest_sum`."""
 
 _NO_COMPASS = 5
 """EKF2_MAG_TYPE: the compass is not used."""
@@ -41,64 +52,88 @@ class Aligned(NamedTuple):
 class Alignment:
     """Waits for each sensor that is needed, and for the vehicle to have rested."""
 
-    def __init__(self, value: Callable[[str], float]) -> None:
-        """Begin without a sample; `value` looks up EKF2_* parameters by name."""
+    def __init__(self, value: Callable[[str], float], record: Record) -> None:
+        """Begin without a sample.
+
+        Args:
+            value: Looks up EKF2_* parameters by name.
+            record: Of the flight controller, which has the sums of all samples.
+        """
         self._value = value
-        self._resting: list[SensorSample] = []
-        self._seen: set[str] = set()
-        """Which of the slower sensors have measured."""
+        self._record = record
         self.field: Vector | None = None
         """The mean field (3,) FRD [gauss], also where it is too disturbed to be used."""
 
-    def take(self, sample: SensorSample) -> Aligned | None:
-        """Take one tick's sensors; return what is known once it is enough."""
-        self._resting.append(sample)
-        needed = self._needed()
-        self._seen |= _kinds(sample, needed)
-        elapsed_s = (sample.time_us - self._resting[0].time_us) / US_PER_S
-        if elapsed_s < ALIGN_S or len(self._seen) < len(needed):
-            if elapsed_s > LONGEST_ALIGN_S:
-                self._forget(needed)
+    def take(self, sample: SensorSample) -> None:
+        """Add one tick's sensors, which the record has already, to the sums."""
+        measured = MAG * (sample.mag is not None) | PRESSURE * (sample.pressure_hpa is not None)
+        add_record(self._record, measured | GPS * (sample.gps is not None))
+
+    def finish(self) -> Aligned | None:
+        """Return what is known once it is enough."""
+        record, needed = self._record, self._needed()
+        elapsed_us = record["time_us"].item(0) - record["rest_since_us"].item(0)
+        counts = record["rest_count"][0].tolist()
+        if elapsed_us < ALIGN_US or not all(counts[kind] for kind in needed):
+            if elapsed_us > LONGEST_ALIGN_US:
+                self._restart()
             return None
-        ax, ay, az = np.mean([s.accel for s in self._resting], axis=0)
+        sums = record["rest_sum"][0]
+        ax, ay, az = (sums[_ACCEL] / counts[IMU]).tolist()
         roll, pitch = math.atan2(-ay, -az), math.atan2(ax, math.hypot(ay, az))
-        heading = self._heading(roll, pitch) if "mag" in needed else 0.0
-        if heading is None:
-            # A heading by it would be wrong, and nothing would tell before the vehicle moves.
-            self._forget(needed)
-            return None
-        baro = [altitude_m(s.pressure_hpa) for s in self._resting if s.pressure_hpa is not None]
-        fix = None
-        if "gps" in needed:
-            fixes = [s.gps.position for s in self._resting if s.gps is not None]
-            fix = Geodetic(*(float(c) for c in np.mean(fixes, axis=0)))
-        self._resting.clear()
-        quaternion = quat_from_euler(roll, pitch, heading)
-        return Aligned(quaternion, float(np.mean(baro)), fix, "mag" in needed)
+        by_compass, heading = COMPASS in needed, 0.0
+        if by_compass:
+            level = tuple(quat_from_euler(roll, pitch, 0.0).tolist())
+            self.field = field = sums[_FIELD] / counts[COMPASS]
+            if FieldCheck.read(self._value).disturbed(field, level):
+                # A heading by it would be wrong, and nothing would show before the vehicle moves.
+                self._restart()
+                return None
+            heading = es.true_heading(field, level, MAGNETIC_DECLINATION)
+        altitude_m = sums.item(_ALTITUDE) / counts[BAROMETER]
+        fix = local_to_geodetic(sums[_PLACE] / counts[FIXES], HOME) if FIXES in needed else None
+        return Aligned(quat_from_euler(roll, pitch, heading), altitude_m, fix, by_compass)
 
-    def _heading(self, roll: float, pitch: float) -> float | None:
-        """Return the compass's [rad]; None where it does not measure the earth's field."""
-        field = np.mean([s.mag for s in self._resting if s.mag is not None], axis=0)
-        level = tuple(quat_from_euler(roll, pitch, 0.0).tolist())
-        self.field = field
-        if FieldCheck.read(self._value).disturbed(field, level):
-            return None
-        return es.true_heading(field, level, MAGNETIC_DECLINATION)
-
-    def _needed(self) -> tuple[str, ...]:
+    def _needed(self) -> tuple[int, ...]:
         """Return the slower sensors of which one sample each is needed.
 
         GPS is not waited for where external vision may take its place.
         """
         gps = self._value("EKF2_GPS_CTRL") != 0 and not self._value("EKF2_EV_CTRL")
         mag = self._value("EKF2_MAG_TYPE") != _NO_COMPASS
-        return (*("gps",) * gps, *("mag",) * mag, "pressure_hpa")
+        return (*(FIXES,) * gps, *(COMPASS,) * mag, BAROMETER)
 
-    def _forget(self, needed: tuple[str, ...]) -> None:
-        """A sensor is missing: keep the newer half of the samples, so that memory stays bounded."""
-        self._resting = self._resting[len(self._resting) // 2 :]
-        self._seen = set().union(*(_kinds(sample, needed) for sample in self._resting))
+    def _restart(self) -> None:
+        """Forget all samples."""
+        self._record["rest_since_us"] = -1
+        self._record["rest_count"], self._record["rest_sum"] = 0, 0.0
 
 
-def _kinds(sample: SensorSample, needed: tuple[str, ...]) -> set[str]:
-    return {name for name in needed if getattr(sample, name) is not None}
+@kernel
+def add(c: Any, measured: int) -> None:
+    """Add the newest sensors of a flight controller at rest (its fields) to the sums.
+
+    `measured` has bits of the slower sensors that are new in this tick (`engine.record`).
+    """
+    if c.rest_since_us < 0:
+        c.rest_since_us = c.time_us
+    c.rest_count[IMU] += 1
+    for i in range(3):
+        c.rest_sum[i] += c.accel[i]
+    if measured & MAG:
+        c.rest_count[COMPASS] += 1
+        for i in range(3):
+            c.rest_sum[3 + i] += c.mag[i]
+    if measured & PRESSURE:
+        c.rest_count[BAROMETER] += 1
+        c.rest_sum[6] += altitude_m(c.pressure_hpa)
+    if measured & GPS:
+        c.rest_count[FIXES] += 1
+        for i in range(3):
+            c.rest_sum[7 + i] += c.gps_position[i]
+
+
+@kernel
+def add_record(controller: Record, measured: int) -> None:
+    """Add the newest sensors of a record (1,) to the sums; as `add`."""
+    add(controller[0], measured)

@@ -42,7 +42,7 @@ from firmware_sim.autopilot.home import Home
 from firmware_sim.autopilot.land_detector import LandDetector
 from firmware_sim.autopilot.manual_control import ManualControl, Source, Sticks
 from firmware_sim.autopilot.navigation.flown_item import Situation
-from firmware_sim.autopilot.navigation.navigator import Navigator
+from firmware_sim.autopilot.navigation.navigator import IDLE_US, Navigator
 from firmware_sim.autopilot.navigation.plan import Plans
 from firmware_sim.autopilot.navigation.whereabouts import Whereabouts
 from firmware_sim.autopilot.newest_sensors import NewestSensors
@@ -116,8 +116,10 @@ class BuiltinAutopilot:
         """When to decide again [µs]."""
         self._decided_on: tuple[Flight | None, object] = (None, None)
         """The commander's state and the setpoint that the newest decision is of."""
-        self._decided_healthy = False
-        """Whether the estimator was healthy then."""
+        self._decided_healthy = 0
+        """Whether the estimator was healthy then, 0 or 1."""
+        self._navigated_on: tuple[object, ...] = ()
+        """State, home, and numbers of changes of plans and parameters at the newest step."""
         self._newest = NewestSensors(record)
         self._home = Home(self.estimator, self._guidance)
         self._whereabouts = Whereabouts(self.estimator, self._newest, self._home, value)
@@ -161,7 +163,9 @@ class BuiltinAutopilot:
         if self._demand is not None:
             control_record(self.record)
         self._detect_ground(sample.time_us)
-        return ActuatorControls(sample.time_us, self._motors, self.flight.phase >= _GROUND)
+        return ActuatorControls(
+            sample.time_us, self._motors, self._commander.flight.phase >= _GROUND
+        )
 
     def take(self, sample: SensorSample) -> None:
         """Take one tick's sensors into the estimate; harmless when called again."""
@@ -170,43 +174,42 @@ class BuiltinAutopilot:
         sensors = self.supervisor.sensors
         sensors.take(sample)
         self.estimator.step(sensors.trusted(sample) if sensors.distrusted else sample)
-        self._heard(sample)
+        self._taken_us, self._snapshot = sample.time_us, None
+        self._newest.take(sample)
         finder = self.estimator.range
         if finder is not None:
             self._guidance.context.ground = self._land_detector.ground = finder.clearance()
         if sample.esc_outputs is not None:
             self.supervisor.watch.hear_escs(sample.time_us, self._motors, sample.esc_outputs)
 
-    def _heard(self, sample: SensorSample) -> None:
-        self._taken_us, self._snapshot = sample.time_us, None
-        self._newest.take(sample)
-
     def decide(self) -> None:
         """Decide what is flown: commander, failsafes, navigator, modes."""
-        sample, supervisor = self._newest.sample, self.supervisor
-        if sample is None:
+        time_us, supervisor = self._taken_us, self.supervisor
+        if time_us < 0:
             return
-        time_us = sample.time_us
-        if self.flight.phase is _AIR and self._guidance.is_done(self._state):
+        if not self.record["aligned"].item(0):
+            self.estimator.align()
+        if self._commander.flight.phase is _AIR and self._guidance.is_done(self._state):
             self._commander.handle(Event.MODE_DONE)
         if self._home.place is None and self.estimator.origin is not None:
-            if self.flight.phase < _GROUND:
+            if self._commander.flight.phase < _GROUND:
                 self._home.set_here()
             else:
                 self._home.locate()
-        readiness = READINESS[self.flight.phase][self.estimator.healthy]
+        readiness = READINESS[self._commander.flight.phase][self.record["healthy"].item(0)]
         if readiness is not None:
             self._commander.handle(readiness)
-        if time_us >= supervisor.next_us:
+        looks = time_us >= supervisor.next_us
+        if looks:
             self._commander.look()
-        due = self._auto_disarm.event(self.flight, time_us, idle=self._demand is None)
+        due = self._auto_disarm.event(self._commander.flight, time_us, idle=self._demand is None)
         if due is not None:
             self._commander.handle(due)
-        if time_us >= self._navigator.due_us:
+        if looks or time_us >= self._navigator.due_us:
             self._navigate()
         if self._manual_control.was_heard:
             self._guidance.context.sticks = self._manual_control.sticks(time_us)
-        self._demand = self._guidance.demand(self._state, self.flight.phase, time_us)
+        self._demand = self._guidance.demand(self._state, self._commander.flight.phase, time_us)
         self._controller.command(self._demand)
 
     # --- compiled ticks
@@ -221,8 +224,8 @@ class BuiltinAutopilot:
         flight, setpoint = self._decided_on
         if (
             self._taken_us >= self._due_us
-            or flight is not self.flight
-            or self._decided_healthy is not self.estimator.healthy
+            or flight is not self._commander.flight
+            or self._decided_healthy != self.record["healthy"].item(0)
             or setpoint is not self._guidance.context.setpoint
             or self._taken_us >= min(self.supervisor.next_us, self._navigator.due_us)
         ):
@@ -233,8 +236,8 @@ class BuiltinAutopilot:
     def _prepare(self) -> None:
         """Prepare the record for compiled ticks, and say when to decide again."""
         self.estimator.prepare()
-        self._decided_on = flight, _ = self.flight, self._guidance.context.setpoint
-        self._decided_healthy = self.estimator.healthy
+        self._decided_on = flight, _ = self._commander.flight, self._guidance.context.setpoint
+        self._decided_healthy = self.record["healthy"].item(0)
         phase = flight.phase
         self.record["detecting"] = (
             LANDING if phase is _AIR else LIFT_OFF if phase is _GROUND else NOTHING
@@ -243,8 +246,8 @@ class BuiltinAutopilot:
         if not self._guidance.is_steady(phase) or self._manual_control.was_heard:
             self._due_us = min(self._due_us, self._taken_us + DECIDE_US)
 
-    def fuse(self, sample: SensorSample, left: int) -> bool:
-        """Fuse what a compiled tick leaves to Python; return whether the health has changed.
+    def fuse(self, sample: SensorSample, left: int) -> None:
+        """Fuse what a compiled tick leaves to Python.
 
         Args:
             sample: Of the tick.
@@ -252,33 +255,41 @@ class BuiltinAutopilot:
         """
         sensors = self.supervisor.sensors
         sensors.repeated(sample.time_us, left, left >> REPEATED_BITS)
-        return self.estimator.fuse_rest(sensors.trusted(sample) if sensors.distrusted else sample)
+        self.estimator.fuse_rest(sensors.trusted(sample) if sensors.distrusted else sample)
 
-    def flown(self, sample: SensorSample) -> bool:
+    def flown(self, read: Callable[[], SensorSample]) -> bool:
         """Take note of compiled ticks; return whether the commander's state has changed by them.
 
-        The sample is the newest, which the estimator has taken.
+        `read` returns the newest sample, which the estimator has taken.
         """
-        before = self.flight
-        self.estimator.flown()
-        self._heard(sample)
-        if self.record["detected"][0]:
-            self._commander.handle(Event.LANDED if self.flight.phase is _AIR else Event.LIFTED)
-        return self.flight is not before
+        before, self._snapshot = self._commander.flight, None
+        self._taken_us = self.estimator.flown()
+        self._newest.follow(read)
+        if not self.record["aligned"].item(0):
+            self._due_us = 0
+        if self.record["detected"].item(0):
+            landed = before.phase is _AIR
+            self._commander.handle(Event.LANDED if landed else Event.LIFTED)
+        return self._commander.flight is not before
 
     @property
     def _motors(self) -> Motors:
         return self._controller.motors
 
     def _navigate(self) -> None:
-        situation, flight = self._situation(), self.flight
+        navigator, flight = self._navigator, self._commander.flight
+        armed = flight.phase >= _GROUND
+        if not armed:
+            self._home.stands()
+        on = flight, self._home.place, self.plans.changes, self.parameters.revision
+        if on == self._navigated_on and navigator.idle:
+            navigator.due_us = self._taken_us + IDLE_US
+            return
+        situation = self._situation()
         if situation is not None:
-            armed = flight.phase >= _GROUND
-            if not armed:
-                self._home.stands()
-            place = self._whereabouts.fenced_place
-            self._navigator.step(situation, flight.mode, place, armed=armed)
-            self._navigator.tell(self._guidance.context, self.supervisor.watch.reports)
+            self._navigated_on = on
+            navigator.step(situation, flight.mode, self._whereabouts.fenced_place, armed=armed)
+            navigator.tell(self._guidance.context, self.supervisor.watch.reports)
 
     def _return_place(self) -> Place | None:
         """Return where Return goes: home, or what RTL_TYPE prefers."""
@@ -287,10 +298,10 @@ class BuiltinAutopilot:
         return home if now is None else self._navigator.return_place(now, home)
 
     def _situation(self) -> Situation | None:
-        return self._whereabouts.situation(landed=self.flight.phase is not _AIR)
+        return self._whereabouts.situation(landed=self._commander.flight.phase is not _AIR)
 
     def _detect_ground(self, time_us: int) -> None:
-        phase = self.flight.phase
+        phase = self._commander.flight.phase
         if phase is _AIR:
             control = self._controller
             if self._land_detector.landed(
@@ -339,7 +350,7 @@ class BuiltinAutopilot:
 
     @property
     def _now_us(self) -> int:
-        return self.sample.time_us if self.sample is not None else 0
+        return max(0, self._taken_us)
 
     # --- towards MAVLink (port.AutopilotPort)
 

@@ -19,7 +19,7 @@ from airl_mav.core.frames import (
     geodetic_to_local,
     local_to_geodetic,
 )
-from airl_mav.core.location import MAGNETIC_DECLINATION
+from airl_mav.core.location import HOME, MAGNETIC_DECLINATION
 from airl_mav.vehicle.atmosphere import altitude_m
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.alignment import Alignment
@@ -108,13 +108,12 @@ class Estimator:
             )
         self.innovations: Callable[[str, Vector, Vector], None] | None = None
         """Called with name, innovation and its covariance for every measurement, if set."""
-        self._alignment = Alignment(value)
+        self._alignment = Alignment(value, record)
         self._judged_us = 0
         """When a velocity of external vision was last held against the inertial sensors."""
         self._chosen_origin: Geodetic | None = None
         """Where local NED shall be zero, chosen before alignment; None = where the vehicle is."""
         self._time_us = 0
-        self._aligned_us: int | None = None
         self._fixed_us: int | None = None
         """When it was aligned where GPS had said that it is; None: not yet, or without GPS."""
         self._estimate: Estimate | None = None
@@ -150,8 +149,6 @@ class Estimator:
         """What tells how the ground moves below; None before the first flow."""
         self.is_changed = True
         """Whether Python has changed what compiled ticks need to know: `prepare` them."""
-        self._field: Vector | None = None
-        """The newest that the compass has measured (3,) FRD [gauss]; before alignment the mean."""
 
     @property
     def healthy(self) -> bool:
@@ -184,8 +181,9 @@ class Estimator:
         """Take one tick's sensors."""
         self._time_us, self._estimate, self.is_changed = sample.time_us, None, True
         self._note(sample)
-        if self._aligned_us is None:
-            self._align(sample)
+        if not self.aligned:
+            self._alignment.take(sample)
+            self.align()
         else:
             self._predict(sample)
             self.yaw.feel(sample.gyro, sample.accel)
@@ -218,6 +216,9 @@ class Estimator:
             record["mag"] = sample.mag
         if sample.pressure_hpa is not None:
             record["pressure_hpa"] = sample.pressure_hpa
+        if sample.gps is not None:
+            record["gps_position"] = geodetic_to_local(sample.gps.position, HOME)
+            record["gps_velocity"] = sample.gps.velocity_ned
 
     def _fuse_slower(self, sample: SensorSample) -> None:
         """Fuse what GPS, barometer and compass have measured."""
@@ -226,12 +227,11 @@ class Estimator:
         if sample.pressure_hpa is not None:
             self._fuse_baro(sample.pressure_hpa)
         if sample.mag is not None:
-            self._field = sample.mag
             self._fuse_heading(sample.mag)
 
     def _settle(self) -> None:
         converged = es.converged(self.state, self.filter.covariance)
-        self.healthy = converged and self._aligned_us is not None
+        self.healthy = converged and self.aligned
 
     # --- compiled ticks
 
@@ -239,8 +239,7 @@ class Estimator:
     def compiled(self) -> bool:
         """Whether compiled ticks estimate as `step` does: no aid besides GPS is in use."""
         return (
-            self._aligned_us is not None
-            and self.range is None
+            self.range is None
             and self.flow is None
             and not self.vision.fused
             and self.innovations is None
@@ -274,34 +273,34 @@ class Estimator:
         suspect = moving.velocity_deviates or recovery.emergency.is_doubted(self._time_us)
         self.record["gps"] = OFF if not self._uses_gps else SUSPECT if suspect else TRUSTED
 
-    def fuse_rest(self, sample: SensorSample) -> bool:
-        """Fuse what a compiled tick leaves to Python; return whether the health has changed."""
+    def fuse_rest(self, sample: SensorSample) -> None:
+        """Fuse what a compiled tick leaves to Python."""
         self._time_us, self._estimate = sample.time_us, None
         self._fuse_slower(sample)
         self._suspect()
-        return bool(settle_record(self.record))
+        settle_record(self.record)
 
-    def flown(self) -> None:
-        """Take note that compiled ticks have moved the estimate."""
+    def flown(self) -> int:
+        """Take note that compiled ticks have moved the estimate; return their time [µs]."""
         self._time_us, self._estimate = self.record["time_us"].item(0), None
-        self._field = self.record["mag"][0]
+        return self._time_us
 
     def see(self, odometry: Odometry) -> None:
         """Take what something else has estimated, now."""
         self.odometry, self.odometry_us = odometry, self._time_us
-        if self._aligned_us is not None:
+        if self.aligned:
             gps = self._uses_gps and self.fuses_gps(self._time_us)
             self.vision.take(odometry, self._time_us, gps=gps, flying=self.flying)
             self._estimate = None
 
     def measure(self, reading: DistanceReading, source: int = 0) -> None:
         """Take what a distance sensor measures now; 0 = the vehicle's own, else a client's."""
-        if self._aligned_us is not None:
+        if self.aligned:
             self._know_ground().take(reading, self._time_us, source)
 
     def look_down(self, reading: FlowReading) -> None:
         """Take what an optical flow sensor measures now."""
-        if self._aligned_us is None:
+        if not self.aligned:
             return
         if self.flow is None:
             self.flow = OpticalFlow(self._value, self.state, self._know_ground(), self._fuse)
@@ -346,7 +345,7 @@ class Estimator:
         """
         before, self._chosen_origin, self.is_changed = self.origin, origin, True
         if before is None:
-            if self._aligned_us is not None:
+            if self.aligned:
                 # Local NED goes on, and is now known to lie there.
                 self.origin, self._estimate = origin, None
             return
@@ -366,7 +365,7 @@ class Estimator:
         the ground, where the biases have hardly been learnt, nobody begins a flight so.
         """
         longest_us = self._value("EKF2_NOAID_TOUT") if flying else GPS_GONE_US
-        if self._aligned_us is None:
+        if not self.aligned:
             return False
         vision, flow = self.vision, self.flow
         return (
@@ -382,7 +381,7 @@ class Estimator:
     def knows_height(self, now_us: int) -> bool:
         """Return whether height and vertical speed are valid: barometer or GPS, as above."""
         longest_us = self._value("EKF2_NOAID_TOUT")
-        return self._aligned_us is not None and (
+        return self.aligned and (
             any(
                 self._recent(m, now_us, longest_us)
                 for m in (self._baro, self._gps_vertical, self.vision.height)
@@ -409,7 +408,11 @@ class Estimator:
     @property
     def aligned(self) -> bool:
         """Whether the attitude is known: the sensors have been averaged at rest."""
-        return self._aligned_us is not None
+        return bool(self.record["aligned"].item(0))
+
+    @aligned.setter
+    def aligned(self, aligned: bool) -> None:
+        self.record["aligned"] = aligned
 
     @property
     def knows_place(self) -> bool:
@@ -424,9 +427,10 @@ class Estimator:
     @property
     def field_disturbed(self) -> bool:
         """Whether the compass measures something else than the earth's field, by EKF2_MAG_CHECK."""
-        if self._field is None:
+        field = self.record["mag"][0] if self.aligned else self._alignment.field
+        if field is None:
             return False
-        return FieldCheck.read(self._value).disturbed(self._field, es.attitude(self.state))
+        return FieldCheck.read(self._value).disturbed(field, es.attitude(self.state))
 
     def accuracy(self) -> tuple[float, float]:
         """Return the standard deviations of horizontal position [m] and velocity [m/s]."""
@@ -441,17 +445,17 @@ class Estimator:
 
     # --- start
 
-    def _align(self, sample: SensorSample) -> None:
-        aligned = self._alignment.take(sample)
-        self._field = self._alignment.field
+    def align(self) -> None:
+        """Align attitude, height and place by what was averaged at rest, if that is enough."""
+        aligned = self._alignment.finish()
         if aligned is None:
             return
-        self._aligned_us = sample.time_us
+        self.aligned = self.is_changed = True
         self.state[es.Q : es.RATES] = aligned.quaternion
         self.vision.is_north_known = aligned.by_compass
         self._origin_altitude_baro = aligned.altitude_baro_m
         if aligned.fix is not None:
-            self.origin, self._fixed_us = aligned.fix, sample.time_us
+            self.origin, self._fixed_us = aligned.fix, self._time_us
         if self._chosen_origin is not None:
             self.move_origin(self._chosen_origin)
 

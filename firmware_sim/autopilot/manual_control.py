@@ -50,15 +50,12 @@ class ManualControl:
     def __init__(self, value: Callable[[str], float]) -> None:
         """Take a lookup of PX4 parameter names."""
         self._value = value
+        self.was_heard = False
+        """Whether any sticks were taken since boot."""
         self._sticks: Sticks | None = None
         self._source: Source | None = None
         self._time_us = 0
         self._rest = Sticks(0.0, 0.0, 0.0, 0.0)
-
-    @property
-    def was_heard(self) -> bool:
-        """Whether any sticks were taken since boot."""
-        return self._sticks is not None
 
     def offer(self, sticks: Sticks, source: Source, time_us: int) -> bool:
         """Take sticks, if their source counts; return whether the pilot moves them.
@@ -79,6 +76,7 @@ class ManualControl:
         self._rest = Sticks(
             *(r + weight * (s - r) for r, s in zip(self._rest, sticks, strict=True))
         )
+        self.was_heard = True
         self._sticks, self._source, self._time_us = sticks, source, time_us
         limit = self._value("COM_RC_STICK_OV") / 100.0
         return any(abs(s - r) > limit for s, r in zip(sticks, self._rest, strict=True))

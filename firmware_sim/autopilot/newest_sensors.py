@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from airl_mav.core.frames import Vector, local_to_geodetic
 from airl_mav.core.location import HOME
 from firmware_sim.engine.record import GPS_ROW, SEEN, Record
@@ -14,8 +16,9 @@ class NewestSensors:
     def __init__(self, record: Record) -> None:
         """Begin without a sample."""
         self._record = record
-        self.sample: SensorSample | None = None
-        """The newest tick's; None before the first."""
+        self._sample: SensorSample | None = None
+        self._read: Callable[[], SensorSample] | None = None
+        """Returns the newest tick's sample; None = it is `_sample`."""
         self._fix: GpsFix | None = None
         self._fix_us = -1
 
@@ -43,8 +46,21 @@ class NewestSensors:
         """[hPa]; NaN before the first sample."""
         return self._record["pressure_hpa"].item(0)
 
+    @property
+    def sample(self) -> SensorSample | None:
+        """The newest tick's; None before the first."""
+        if self._read is not None:
+            self.take(self._read())
+        return self._sample
+
     def take(self, sample: SensorSample) -> None:
         """Take a tick's sample."""
-        self.sample = sample
+        self._sample, self._read = sample, None
         if sample.gps is not None:
             self._fix, self._fix_us = sample.gps, sample.time_us
+
+    def follow(self, read: Callable[[], SensorSample]) -> None:
+        """Take note of compiled ticks; `read` returns the newest sample when it is needed."""
+        self._read = read
+        if self._fix is None:
+            self.take(read())

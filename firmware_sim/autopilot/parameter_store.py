@@ -63,7 +63,7 @@ class Parameters:
         self.revision = 0
         """Another number after each change of a value, the same until then."""
         self._listeners: list[Callable[[], None]] = []
-        self._bounded: set[str] = {name for name in values if self._is_bounded(name)}
+        self._bounded: set[str] = {name for name in overrides or () if self._is_bounded(name)}
         """Parameters whose stored value is flown bounded, and said to be."""
         self._texts: list[Message] = [self._bounded_text(name) for name in sorted(self._bounded)]
         self._keeper = keeper

@@ -7,6 +7,7 @@ commander/HealthAndArmingChecks; a check of what this vehicle does not have is l
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 from typing import NamedTuple
 
 from firmware_sim.autopilot.autopilot_state import Severity
@@ -391,6 +392,7 @@ CHECKS: tuple[Check, ...] = (
 """In the order in which they are told."""
 
 
+@lru_cache(maxsize=256)
 def failing(readiness: Readiness) -> tuple[Check, ...]:
     """Return the checks that fail."""
     return tuple(check for check in CHECKS if check.fails(readiness))

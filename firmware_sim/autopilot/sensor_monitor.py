@@ -9,9 +9,9 @@ sensor has noise is learnt at rest, from its first second.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -106,11 +106,6 @@ class SensorWatch:
         self.failed = ""
         """Why it has failed: TIMEOUT or STALE; empty = it has not."""
 
-    @property
-    def seen(self) -> bool:
-        """Whether it has ever measured."""
-        return self._times.item(SEEN) >= 0
-
     def take(self, sample: SensorSample) -> None:
         """Take a sample in which it has measured."""
         value, now_us = self.kind.read(sample), sample.time_us
@@ -123,45 +118,44 @@ class SensorWatch:
         self._value, times[CHANGED] = value, now_us
         if times[FIRST] < 0:
             times[FIRST] = now_us
-        self._learn()
 
     def repeat(self, now_us: int) -> None:
         """Note that its newest sample, which a compiled tick took, is that before."""
         self.repeats, self._times[SEEN] = True, now_us
         self._noisy = self._noisy or False
 
-    def _learn(self) -> None:
-        seen, _, first = self._times.tolist()
-        if self._noisy is None and first >= 0 and seen - first >= LEARN_US:
-            self._noisy = True
+    def judge(self, now_us: int, times_us: Sequence[int], *, flying: bool) -> Message | None:
+        """Return a text when it fails now; `times_us` is its row of `watch`.
 
-    def judge(self, now_us: int, *, flying: bool) -> Message | None:
-        """Return a text when it fails now. Standing still, a perfect sensor may repeat itself."""
-        if not self.seen:
+        Standing still, a perfect sensor may repeat itself.
+        """
+        seen_us, changed_us, first_us = times_us
+        if seen_us < 0:
             return None
-        self._learn()
-        times = self._times
+        if self._noisy is None and first_us >= 0 and seen_us - first_us >= LEARN_US:
+            self._noisy = True
         if not (flying or self._noisy):
-            times[CHANGED] = times[SEEN]
-        before = self.failed
-        if now_us - times[SEEN] > self.kind.timeout_us:
+            self._times[CHANGED] = changed_us = seen_us
+        before, self.failed = self.failed, ""
+        if now_us - seen_us > self.kind.timeout_us:
             self.failed = "TIMEOUT"
-        elif now_us - times[CHANGED] > self.kind.stale_us:
+        elif now_us - changed_us > self.kind.stale_us:
             self.failed = "STALE"
-        else:
-            self.failed = ""
         if not self.failed or before:
             return None
         text, event = f"{self.kind.name} #0 failed: {self.failed}!", self.kind.event
         told = None if event is None else event(_REASONS[self.failed])
         return Message(Severity.EMERGENCY, text, told)
 
-    def has_data(self, now_us: int) -> bool:
-        """Return whether its data are valid for flight."""
-        seen_us, changed_us, _ = self._times.tolist()
-        if seen_us < 0 or now_us - seen_us >= NO_DATA_US:
-            return False
-        return self.failed != "STALE" or now_us - changed_us < NO_DATA_US
+
+class Valid(NamedTuple):
+    """Whether the data of each sensor are valid for flight."""
+
+    gyro: bool
+    accel: bool
+    mag: bool
+    baro: bool
+    gps: bool
 
 
 class SensorMonitor:
@@ -169,7 +163,7 @@ class SensorMonitor:
 
     def __init__(self, watch: NDArray[np.int64] | None = None) -> None:
         """Begin without a sample, in `watch` (`engine.record`); None = a new one."""
-        times = np.full((WATCHES, 3), -1) if watch is None else watch
+        self._times = times = np.full((WATCHES, 3), -1) if watch is None else watch
         self.gyro, self.accel, self.mag, self.baro, self.gps = self.all = tuple(
             SensorWatch(kind, row)
             for kind, row in zip((GYRO, ACCEL, MAG, BARO, GPS), times, strict=True)
@@ -219,8 +213,20 @@ class SensorMonitor:
         now_us, self._flying = sample.time_us, flying
         self.gyro.take(sample)
         self.accel.take(sample)
-        texts = [watch.judge(now_us, flying=flying) for watch in self.all]
-        return [text for text in texts if text is not None]
+        texts: list[Message] = []
+        for watch, times_us in zip(self.all, self._times.tolist(), strict=True):
+            text = watch.judge(now_us, times_us, flying=flying)
+            if text is not None:
+                texts.append(text)
+        return texts
+
+    def valid(self, now_us: int) -> Valid:
+        """Return which sensors have measured lately, and not only repeated themselves."""
+        data = []
+        for watch, (seen_us, changed_us, _) in zip(self.all, self._times.tolist(), strict=True):
+            newest_us = changed_us if watch.failed == "STALE" else seen_us
+            data.append(seen_us >= 0 and now_us - newest_us < NO_DATA_US)
+        return Valid._make(data)
 
     def trusted(self, sample: SensorSample) -> SensorSample:
         """Return a sample without what must not be fused."""

@@ -67,6 +67,7 @@ AIRCRAFT = np.dtype(
         ("start_us", _I),
         ("moves_us", _I),
         ("closing_m_s", _F),  # greatest speed of an obstacle
+        ("footing_m", _F),  # from the centre to the nearest edge that it may tip over
         # True state.
         ("ticks", _I),
         ("time_us", _I),
@@ -77,7 +78,8 @@ AIRCRAFT = np.dtype(
         ("power_w", _F),
         ("battery", _F, 4),  # voltage [V], current [A], charge used [mAh], charge left 0..1
         ("room_m", _F),  # nothing that can be touched is nearer, but for the floor at rest
-        ("resting", _I),  # 1 = stands on the floor, motors and rotors stopped
+        ("held", _I),  # 1 = the floor would hold it against rotors and wind of the newest tick
+        ("resting", _I),  # 1 = stands on the floor, and stays there while it is held
         # Sensors: noise, biases, schedules.
         ("imu_sigma", _F, 12),
         ("accel_bias", _F, 3),
@@ -131,6 +133,11 @@ CONTROLLER = np.dtype(
         ("gps_position", _F, 3),
         ("gps_velocity", _F, 3),
         ("watch", _I, (WATCHES, 3)),
+        # Alignment at rest: sums of accelerometer, compass, barometric altitude, fix.
+        ("aligned", _I),
+        ("rest_since_us", _I),  # -1 = no sample yet
+        ("rest_count", _I, 4),  # as `alignment.IMU` and so on
+        ("rest_sum", _F, 10),
         # Estimator.
         ("state", _F, ROW_SIZE),
         ("covariance", _F, (N_STATES, N_STATES)),
@@ -204,6 +211,8 @@ FLOWN_TICK = np.dtype(
         ("mag", _F, 3),
         ("pressure_hpa", _F),
         ("temperature_c", _F),
+        ("gps_position", _F, 3),
+        ("gps_velocity", _F, 3),
         ("demand_kind", _I),
         ("demand", _F, DEMAND_SIZE),
         ("output", _F, OUTPUT_SIZE),
@@ -231,7 +240,7 @@ def new_controller() -> Record:
     """Return a record of a flight controller that has just booted."""
     record = np.zeros(1, CONTROLLER)
     never = ("baro_fused_us", "heading_fused_us", "gps_horizontal_us", "gps_vertical_us")
-    for name in (*never, "watch", "still_since_us"):
+    for name in (*never, "watch", "still_since_us", "rest_since_us"):
         record[name] = -1
     record["origin"] = record["velocity_before"] = np.nan
     record["velocity_noise"] = 1.0

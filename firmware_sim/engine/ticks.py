@@ -33,6 +33,7 @@ from airl_mav.vehicle.airframe import airframe_of
 from airl_mav.vehicle.rigid_body import accelerate, drift
 from airl_mav.vehicle.rotation import Vec, conjugate, rotate
 from firmware_sim.autopilot import error_state as es
+from firmware_sim.autopilot.alignment import ALIGN_US, FIXES, add
 from firmware_sim.autopilot.consistency import FAR, note_velocity
 from firmware_sim.autopilot.emergency_yaw import REFUSED_US
 from firmware_sim.autopilot.filter_kernel import fuse, predict, spread
@@ -63,11 +64,11 @@ from firmware_sim.engine.record import (
     Record,
 )
 
-NONE, NOISE, ROOM, FUSE, HEALTH, DETECTED, COLLIDED = 0, 1, 2, 3, 4, 5, 6
+NONE, NOISE, ROOM, FUSE, HEALTH, DETECTED, COLLIDED, ALIGN = 0, 1, 2, 3, 4, 5, 6, 7
 """Why `stretch` returned: all ticks are flown; a block of noise is used up; a contact is possible
 in the coming tick; Python has to fuse what the newest tick measured; the estimator has converged,
 or no longer is; the land detector has detected lift-off or landing; the vehicle has hit something
-(`Plant.touch`)."""
+(`Plant.touch`); the estimator may be aligned, or has its first fix."""
 
 REPEATED_BITS = 3
 """`estimate` returns bits of `measured`; shifted by so many, which sensors repeated their last
@@ -80,6 +81,16 @@ EVENT_MASK = (1 << EVENT_BITS) - 1
 
 ROOM_M = 0.15
 """Contacts are impossible in a tick that begins with more room: 37 m/s in 4 ms [m]."""
+
+FRICTION = 0.8
+"""Of the body on the floor, as `plant.bullet_body` has it."""
+
+HOLD_SHARE = 0.5
+"""The floor holds a vehicle against forces and torques up to this share of what friction and weight
+can bear."""
+
+LIGHT_SHARE = 0.1
+"""A vehicle that presses on the floor with less of its weight is about to lift off."""
 
 CALM_RATIO = 0.6
 """Headings within this test ratio (3 standard deviations) are fused without further judgement; see
@@ -198,6 +209,7 @@ def log_flown(c: Fields, flown: Fields) -> None:
         flown.state[i] = c.state[i]
     for i in range(3):
         flown.accel[i], flown.gyro[i], flown.mag[i] = c.accel[i], c.gyro[i], c.mag[i]
+        flown.gps_position[i], flown.gps_velocity[i] = c.gps_position[i], c.gps_velocity[i]
     flown.pressure_hpa, flown.temperature_c = c.pressure_hpa, c.temperature_c
     flown.demand_kind = c.demand_kind
     for i in range(_THRUST + 1):
@@ -218,6 +230,15 @@ def push(a: Fields, motors: Speeds, wind: Vector) -> tuple[Vec, Vec, Vec]:
     )
     for i in range(4):
         a.speeds[i] = speeds[i]
+    weight_n = airframe_of(a.airframe).mass * GRAVITY_M_S2
+    pressing_n = weight_n + pushed[2]
+    bears_n = HOLD_SHARE * FRICTION * pressing_n
+    a.held = (
+        pressing_n > LIGHT_SHARE * weight_n
+        and math.hypot(pushed[0], pushed[1]) <= bears_n
+        and math.hypot(torque[0], torque[1]) <= HOLD_SHARE * pressing_n * a.footing_m
+        and abs(torque[2]) <= bears_n * a.footing_m
+    )
     return here, pushed, torque
 
 
@@ -251,11 +272,18 @@ def finish(a: Fields, after: Vector, wind: Vector, standing: bool) -> None:
 
 
 @kernel
+def _turning(a: Fields, c: Fields) -> Speeds:
+    """Return the motor commands; an empty battery turns no motor."""
+    if a.charge <= 0.0:
+        return 0.0, 0.0, 0.0, 0.0
+    return c.motors[0], c.motors[1], c.motors[2], c.motors[3]
+
+
+@kernel
 def _glide(a: Fields, c: Fields, wind: Vector, after: Vector) -> None:
     """Move an aircraft that touches nothing by one tick; `after` (16,) is scratch."""
-    m, before, dt = c.motors, a.motion, a.tick_s
-    motors = (m[0], m[1], m[2], m[3]) if a.charge > 0.0 else (0.0, 0.0, 0.0, 0.0)
-    here, thrust, torque = push(a, motors, wind)
+    before, dt = a.motion, a.tick_s
+    here, thrust, torque = push(a, _turning(a, c), wind)
     q, airframe = quaternion(before), airframe_of(a.airframe)
     turn = rotate(conjugate(q), torque)
     v, spin = accelerate(velocity(before), q, rates(before), thrust, turn, airframe, dt)
@@ -276,8 +304,9 @@ def log(a: Fields, truth: Fields) -> None:
 
 
 @kernel
-def _rest(a: Fields, wind: Vector, after: Vector) -> None:
+def _rest(a: Fields, motors: Speeds, wind: Vector, after: Vector) -> None:
     """Let an aircraft stand where it is for one tick; `after` (16,) is scratch."""
+    push(a, motors, wind)
     row = a.motion
     for i in range(WIDTH):
         after[i] = row[i]
@@ -287,9 +316,9 @@ def _rest(a: Fields, wind: Vector, after: Vector) -> None:
 
 
 @kernel
-def rest_record(aircraft: Record, wind: Vector) -> None:
+def rest_record(aircraft: Record, motors: Speeds, wind: Vector) -> None:
     """Let the aircraft of a record (1,) stand where it is for one tick."""
-    _rest(aircraft[0], wind, np.empty(WIDTH))
+    _rest(aircraft[0], motors, wind, np.empty(WIDTH))
 
 
 @kernel
@@ -503,6 +532,18 @@ def fuse_heading(c: Fields) -> bool:
     return True
 
 
+@kernel
+def _await_alignment(c: Fields, sample: Fields) -> bool:
+    """Add a sample at rest to the sums; return whether Python has to look at them."""
+    c.time_us, c.temperature_c = sample.time_us, sample.temperature_c
+    for i in range(3):
+        c.accel[i], c.gyro[i] = sample.accel[i], sample.gyro[i]
+    _take(c, sample)
+    add(c, sample.measured)
+    first_fix = sample.measured & GPS != 0 and c.rest_count[FIXES] == 1
+    return first_fix or c.time_us - c.rest_since_us >= ALIGN_US
+
+
 @large_kernel
 def estimate(c: Fields, sample: Fields) -> int:
     """Predict by the IMU's newest sample, and fuse what was measured with it.
@@ -554,9 +595,7 @@ def begin_touch(
     command(c, flown[0])
     for i in range(4):
         flown[0].battery[i] = a.battery[i]
-    m = c.motors
-    motors = (m[0], m[1], m[2], m[3]) if a.charge > 0.0 else (0.0, 0.0, 0.0, 0.0)
-    return push(a, motors, wind)
+    return push(a, _turning(a, c), wind)
 
 
 @kernel
@@ -581,6 +620,8 @@ def end_touch(
     finish(a, after, wind, standing)
     log(a, truth[0])
     sense(a, sample[0], inertial, compass, barometer, gps)
+    if c.aligned == 0:
+        return ALIGN if _await_alignment(c, sample[0]) else NONE
     c.left = estimate(c, sample[0])
     if c.left != 0:
         return FUSE
@@ -652,7 +693,7 @@ def stretch(
             or (not steady and at[_WIND] >= len(wind))
         ):
             return k << EVENT_BITS | NOISE
-        if not a.room_m > ROOM_M:
+        if not a.room_m > ROOM_M or (a.resting != 0 and a.held == 0):
             return k << EVENT_BITS | ROOM
         row = flown[k]
         command(c, row)
@@ -662,11 +703,15 @@ def stretch(
         if not steady:
             at[_WIND] += 1
         if a.resting != 0:
-            _rest(a, air, after)
+            _rest(a, _turning(a, c), air, after)
         else:
             _glide(a, c, air, after)
         log(a, truths[k])
         sense(a, seen, inertial, compass, barometer, gps)
+        if c.aligned == 0:
+            if _await_alignment(c, seen):
+                return (k + 1) << EVENT_BITS | ALIGN
+            continue
         c.left = estimate(c, seen)
         if c.left != 0:
             return k << EVENT_BITS | FUSE

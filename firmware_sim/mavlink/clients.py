@@ -9,12 +9,13 @@ another.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Geodetic
 from airl_mav.core.signing import Signing
+from firmware_sim.autopilot.autopilot_state import Message
 from firmware_sim.mavlink.allowance import Allowance
 from firmware_sim.mavlink.codec import Decoder, WireMessage, is_signed
 from firmware_sim.mavlink.endpoint import Endpoint, Peer, SharedEndpoint
@@ -63,6 +64,18 @@ class Client:
     """Streams that have found no room in their tick."""
     components: set[tuple[int, int]] = field(default_factory=set)
     """System and component ids of who has been heard from its side."""
+
+    def wakes(self, now_us: int, texts: Sequence[Message]) -> bool:
+        """Return whether anything may have to be sent to it at simulated time [µs]."""
+        events = self.events
+        return bool(
+            self.link.scheduler.wake_us <= now_us
+            or texts
+            or self.late
+            or self.link.pending
+            or self.announced_origin is None
+            or (events is not None and events.has_news(now_us))
+        )
 
     def due(self, now_us: int) -> list[str]:
         """Return the streams to send now, at simulated time [µs]: first what is late."""

@@ -148,24 +148,20 @@ class Link:
         self._decoder = Decoder(datagrams=config.endpoint.datagrams)
         self._signing = signing
         self._link_id = link_id
-        self._pending: list[bytes] = []
+        self.pending: list[bytes] = []
         """This tick's telemetry."""
         self._rx = 0
-        self._tx = 0
+        self.sent = 0
+        """Frames sent."""
         self._refused = 0
         self._unsendable = 0
-
-    @property
-    def sent(self) -> int:
-        """Frames sent."""
-        return self._tx
 
     @property
     def counters(self) -> LinkCounters:
         """Traffic so far."""
         return LinkCounters(
             rx=self._rx,
-            tx=self._tx,
+            tx=self.sent,
             malformed=self._decoder.malformed,
             ignored=self.ignored + self._decoder.unknown,
             send_errors=self._unsendable + self.endpoint.send_errors,
@@ -230,7 +226,7 @@ class Link:
     def pass_on(self, frame: bytes) -> None:
         """Send somebody else's frame as it is."""
         self.endpoint.send(frame)
-        self._tx += 1
+        self.sent += 1
         if self.tap is not None:
             self.tap((frame,))
 
@@ -239,7 +235,7 @@ class Link:
             self.flush()  # frames leave in the order of their sequence numbers
         frame = self._signed(frame)
         self.endpoint.send(frame)
-        self._tx += 1
+        self.sent += 1
         if self.tap is not None:
             self.tap((frame,))
 
@@ -249,14 +245,14 @@ class Link:
         """Add a message to this tick's telemetry; as `send` when its values do not fit."""
         frame = self._packed(self._stream_encoder, message)
         if frame is not None:
-            self._pending.append(frame)
+            self.pending.append(frame)
 
     def stream_due(self, names: Iterable[str], state: AutopilotState, payloads: Payloads) -> None:
         """Add streams to this tick's telemetry; as `send` when their values do not fit.
 
         `payloads` is what has been built from this tick's snapshot; gets what is built here.
         """
-        frames, encoder = self._pending, self._stream_encoder
+        frames, encoder = self.pending, self._stream_encoder
         for name in names:
             shape, builder = self._streams[name]
             if builder in payloads:
@@ -284,18 +280,18 @@ class Link:
         )
         encoder.skip(len(frames))
         plan.packed()
-        self._pending += frames
+        self.pending += frames
 
     def flush(self) -> None:
         """Send the telemetry that has been added."""
-        frames = self._pending
+        frames = self.pending
         if not frames:
             return
-        self._pending = []
+        self.pending = []
         if self._signing is not None and self._signing.key is not None:
             frames = [self._signed(frame) for frame in frames]
         self.endpoint.send_streams(frames)
-        self._tx += len(frames)
+        self.sent += len(frames)
         if self.tap is not None:
             self.tap(frames)
 

@@ -56,6 +56,8 @@ class StreamScheduler:
         """When the next of the fast streams is due, or earlier [µs]."""
         self._next_us = 0
         """When the next of the others is due [µs]."""
+        self.wake_us = 0
+        """The earlier of the two [µs]: before, there is nothing to do."""
         self._rebase_pending = False
         self._rebase(0)
 
@@ -76,15 +78,17 @@ class StreamScheduler:
             return
         self.intervals_us[index] = interval_us
         self.due_us[index] = _NEVER if interval_us == OFF else now_us
-        self._next_us = self.fast_us = min(self._next_us, self.fast_us, now_us)
+        self.wake_us = self._next_us = self.fast_us = min(self.wake_us, now_us)
 
     def restart(self) -> None:
         """Keep the intervals, take the time base from the next call (it may have jumped)."""
         self._rebase_pending = True
+        self.wake_us = 0
 
     def packed(self) -> None:
         """Take note that fast streams were packed, and planned anew."""
         self.fast_us = int(np.minimum.reduce(self.due_us[self._fast], initial=_NEVER))
+        self.wake_us = min(self.fast_us, self._next_us)
 
     def begin(self, now_us: int) -> None:
         """Take simulated `now_us` [µs] for the time base, where that is asked for."""
@@ -103,10 +107,11 @@ class StreamScheduler:
         due_us[late] += intervals * (1 + (now_us - due_us[late]) // intervals)
         self.due_us[self._slow] = due_us
         self._next_us = int(np.minimum.reduce(due_us))
+        self.wake_us = min(self.fast_us, self._next_us)
         return [self._names[i] for _, i in order]
 
     def _rebase(self, now_us: int) -> None:
         self._rebase_pending = False
         for i, interval in enumerate(self.intervals_us.tolist()):
             self.due_us[i] = _NEVER if interval == OFF else now_us + i * TICK_US % interval
-        self._next_us = self.fast_us = now_us
+        self.wake_us = self._next_us = self.fast_us = now_us

@@ -13,7 +13,7 @@ from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.frames import Vector
 from airl_mav.core.signing import Signing
 from airl_mav.core.signing_key import StoredSigning
-from firmware_sim.autopilot.autopilot_state import AutopilotState, Message
+from firmware_sim.autopilot.autopilot_state import Message
 from firmware_sim.autopilot.port import AutopilotPort
 from firmware_sim.engine.record import Record
 from firmware_sim.interfaces import Truth
@@ -33,7 +33,7 @@ from firmware_sim.mavlink.services.context import Context
 from firmware_sim.mavlink.services.running_calibration import RunningCalibration
 from firmware_sim.mavlink.streams import BUILDERS, Builder
 from firmware_sim.mavlink.streams.status import system_time
-from firmware_sim.mavlink.telemetry import context_of, flown_of
+from firmware_sim.mavlink.telemetry import Ints, context_of, flown_of
 from firmware_sim.mavlink.texts import REPLY_IDS, TextEncoder
 from firmware_sim.mavlink.tick_time import TickTime
 from firmware_sim.mavlink.tlog import TlogWriter
@@ -124,7 +124,7 @@ class MavlinkServer:
             **BUILDERS,
             "SYSTEM_TIME": system_time(boot_unix_us),
             **self._streams.builders,
-            "TIMESYNC": peers.timesync_request,
+            "TIMESYNC": None,
         }
         self._forwarder = Forwarder(self._all)
         self._traffic = TrafficLog(lambda: self._now_us)
@@ -187,7 +187,6 @@ class MavlinkServer:
             return
         if port.sample is None:
             return
-        state: AutopilotState | None = None
         if flown is None:
             flown, times_us = flown_of(port.state()), np.array([now_us])
         else:
@@ -198,34 +197,50 @@ class MavlinkServer:
             self._events.add(event, now_us)
         everyone = list(self._all())
         self._send_pending(everyone, now_us)
-        context: Vector | None = None
-        payloads: Payloads = {}
         for clients in self._links:
             clients.renew()
-        due = [(client, client.due(now_us)) for client in everyone]
-        most = max(1, STREAMS_PER_TICK // (2 * max(1, len(due))))
+        due = [(client, client.due(now_us)) for client in everyone if client.wakes(now_us, texts)]
+        if due:
+            self._stream(due, flown, times_us, texts)
+        if now_us >= self._forget_us:
+            self._forget(now_us)
+
+    def _stream(
+        self,
+        due: Sequence[tuple[Client, list[str]]],
+        flown: Record,
+        times_us: Ints,
+        texts: Sequence[Message],
+    ) -> None:
+        """Send clients texts, events and the streams that are due.
+
+        Args:
+            due: Clients that have something to be sent, and their slow streams.
+            flown: (n,) logs of the newest ticks.
+            times_us: (n,) when they ended [µs].
+            texts: For operators.
+        """
+        assert self._port is not None  # noqa: S101 (the caller has looked)
+        now_us, state = self._now_us, self._port.state()
+        origin = state.origin
+        context: Vector | None = None
+        payloads: Payloads = {}
+        most = max(1, STREAMS_PER_TICK // (2 * len(due)))
         share = _share([len(names) for _, names in due])
         for client, names in due:
             link = client.link
-            fast = link.scheduler.fast_us <= now_us
-            if fast:
-                state = state or port.state()
+            if link.scheduler.fast_us <= now_us:
                 context = context_of(state) if context is None else context
                 link.stream_fast(flown, times_us, context, most)
             if texts or (client.events is not None and client.events.has_news(now_us)):
                 _stream_news(client, texts, now_us)
             if len(names) > share:
                 names, client.late = names[:share], names[share:]
-            if names or fast or client.announced_origin is None:
-                # Not in every tick: the snapshot costs more than asking the schedulers.
-                state = state or port.state()
-                if state.origin is not None and state.origin != client.announced_origin:
-                    client.announced_origin = state.origin
-                    link.stream_due(("GPS_GLOBAL_ORIGIN",), state, payloads)
-                link.stream_due(names, state, payloads)
+            if origin is not None and origin != client.announced_origin:
+                client.announced_origin = origin
+                names = ["GPS_GLOBAL_ORIGIN", *names]
+            link.stream_due(names, state, payloads)
             link.flush()
-        if now_us >= self._forget_us:
-            self._forget(now_us)
 
     def _forget(self, now_us: int) -> None:
         """Forget silent clients, complain of floods, save the newest time stamp of signatures."""

@@ -15,26 +15,32 @@ from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+from numba.extending import register_jitable
 from numpy.typing import NDArray
 
+from airl_mav.core.clock import NS_PER_US
 from airl_mav.core.constants import GRAVITY_M_S2
-from airl_mav.core.frames import Geodetic, Vector, local_to_geodetic
+from airl_mav.core.frames import Geodetic, Vector, geodetic_to_local, local_to_geodetic
 from airl_mav.core.kernels import kernel, large_kernel
+from airl_mav.core.location import HOME
 from airl_mav.vehicle import atmosphere
 from airl_mav.vehicle.rotation import rotate, yaw_of
 from firmware_sim.autopilot import error_state as es
+from firmware_sim.autopilot import esc
 from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState
 from firmware_sim.engine.record import FLOWN_TICK, POSITION, TRAJECTORY, Fields, Record
 from firmware_sim.mavlink.codec import COMPONENT_ID, dialect, message_id
 from firmware_sim.mavlink.streams import units
 from firmware_sim.mavlink.streams.distance import clearance
 
+register_jitable(esc.current_a)
+
 Ints = NDArray[np.int64]
 Bytes = NDArray[np.uint8]
 
 _SOURCES: Final = (
     *("zero", "nan", "one", "healthy", "located"),
-    *("time_us", "boot_ms"),
+    *("time_us", "boot_ms", "sync_ns"),
     *("roll", "pitch", "yaw", "qw", "qx", "qy", "qz", "p", "q", "r"),
     *("x", "y", "z", "vx", "vy", "vz"),
     *("var_x", "var_y", "var_z", "var_roll", "var_pitch", "var_yaw", "var_vx", "var_vy", "var_vz"),
@@ -47,7 +53,13 @@ _SOURCES: Final = (
     *("sp_mask", "sp_x", "sp_y", "sp_z", "sp_vx", "sp_vy", "sp_vz", "sp_ax", "sp_ay", "sp_az"),
     *("sp_yaw", "sp_yaw_rate"),
     *("pwm_1", "pwm_2", "pwm_3", "pwm_4", "pwm_off"),
-    *("local_ned", "autopilot"),
+    *("local_ned", "autopilot", "global_int", "four", "ppm", "all_escs", "unknown_u16"),
+    *("goal_known", "goal_lat_e7", "goal_lon_e7", "goal_amsl", "goal_yaw"),
+    *("fix_known", "fix_type", "fix_lat_e7", "fix_lon_e7", "fix_mm", "fix_cm_s", "fix_cdeg"),
+    *("satellites", "eph_mm", "epv_mm"),
+    *("esc_cdeg_1", "esc_cdeg_2", "esc_cdeg_3", "esc_cdeg_4"),
+    *("rpm_1", "rpm_2", "rpm_3", "rpm_4", "volt"),
+    *("ampere_1", "ampere_2", "ampere_3", "ampere_4"),
 )
 _AT: Final = {name: place for place, name in enumerate(_SOURCES)}
 
@@ -97,12 +109,39 @@ FIELDS: Mapping[str, tuple[str, ...]] = MappingProxyType(
             *("pwm_off",) * 12,
         ),
         "VFR_HUD": ("zero", "ground_speed", "heading_deg", "throttle", "hud_alt", "climb"),
+        # Our own request.
+        "TIMESYNC": ("zero", "sync_ns"),
+        # Where an automatic mode is going, and how fast the vehicle shall be now.
+        "POSITION_TARGET_GLOBAL_INT": (
+            *("boot_ms", "global_int", "zero", "goal_lat_e7", "goal_lon_e7", "goal_amsl"),
+            *("sp_vx", "sp_vy", "sp_vz", "sp_ax", "sp_ay", "sp_az", "goal_yaw", "zero"),
+        ),
+        # The newest fix. Dilution of precision is unknown.
+        "GPS_RAW_INT": (
+            *("time_us", "fix_type", "fix_lat_e7", "fix_lon_e7", "fix_mm"),
+            *("unknown_u16", "unknown_u16", "fix_cm_s", "fix_cdeg", "satellites"),
+            *("fix_mm", "eph_mm", "epv_mm"),
+        ),
+        # Four speed controllers, all of them on line.
+        "ESC_INFO": (
+            *("zero", "time_us", "zero", "four", "ppm", "all_escs", *("zero",) * 8),
+            *("esc_cdeg_1", "esc_cdeg_2", "esc_cdeg_3", "esc_cdeg_4"),
+        ),
+        "ESC_STATUS": (
+            *("zero", "time_us", "rpm_1", "rpm_2", "rpm_3", "rpm_4", *("volt",) * 4),
+            *("ampere_1", "ampere_2", "ampere_3", "ampere_4"),
+        ),
     }
 )
 """The messages and the sources of their fields."""
 
 NEEDS: Mapping[str, str] = MappingProxyType(
-    {"LOCAL_POSITION_NED": "healthy", "GLOBAL_POSITION_INT": "located"}
+    {
+        "LOCAL_POSITION_NED": "healthy",
+        "GLOBAL_POSITION_INT": "located",
+        "POSITION_TARGET_GLOBAL_INT": "goal_known",
+        "GPS_RAW_INT": "fix_known",
+    }
 )
 """A source without which there is nothing to say."""
 
@@ -181,15 +220,28 @@ _CRC = _crc_table()
 
 # What stays the same while compiled ticks are flown.
 _LATITUDE, _LONGITUDE, _ORIGIN_M, _HOME_M, _ARMED, _HOVER, _TERRAIN, _CLEARANCE = range(8)
+_GOAL, _FIX, _ESCS = 8, 11, 15
+_CONTEXT_SIZE = 19
 
 
 def context_of(state: AutopilotState) -> Vector:
-    """Return what the messages need besides a tick's log (8,); NaN = not known."""
-    context = np.full(8, math.nan)
-    if state.origin is not None:
-        context[:_HOME_M] = state.origin
-    if state.home is not None:
-        context[_HOME_M] = state.home.altitude_m
+    """Return what the messages need besides a tick's log (19,); NaN = not known.
+
+    That is origin, height of home, arming, hover thrust, ground below, destination (local NED),
+    type, satellites and accuracies of the newest fix, and what speed controllers report.
+    """
+    context = np.full(_CONTEXT_SIZE, math.nan)
+    origin, home, goal, fix = state.origin, state.home, state.destination, state.gps
+    if origin is not None:
+        context[:_HOME_M] = origin
+        if goal is not None:
+            context[_GOAL:_FIX] = goal
+    if home is not None:
+        context[_HOME_M] = home.altitude_m
+    if fix is not None:
+        context[_FIX:_ESCS] = fix.fix_type, fix.satellites, fix.eph_m, fix.epv_m
+    if (outputs := state.esc_outputs) is not None:
+        context[_ESCS:] = outputs
     context[_ARMED] = state.status.arming is Arming.ARMED
     context[_HOVER] = state.hover_thrust
     if state.clearance is not None:
@@ -223,6 +275,9 @@ def flown_of(state: AutopilotState) -> Record:
         ("battery", state.battery),
     ):
         flown[name] = value
+    if (fix := state.gps) is not None:
+        flown["gps_position"] = geodetic_to_local(fix.position, HOME)
+        flown["gps_velocity"] = fix.velocity_ned
     flown["demand"][0, :8] = (*wanted.position, *wanted.velocity, wanted.yaw, wanted.yaw_rate)
     flown["output"] = (
         *state.attitude_setpoint,
@@ -330,13 +385,65 @@ def _wanted(v: Vector, row: Fields, context: Vector) -> None:
         v[_PWM_1 + i] = pulse if armed else _PWM_DISARMED
 
 
+@kernel
+def _speed_controllers(v: Vector, row: Fields, context: Vector) -> None:
+    """Write what the speed controllers report: what they are told, where nothing else is known."""
+    armed, told = context[_ARMED] != 0.0, math.isnan(context[_ESCS])
+    for i in range(4):
+        output = context[_ESCS + i]
+        if told:
+            output = row.motors[i] if armed else 0.0
+        v[_ESC_CDEG_1 + i] = units.int16((esc.IDLE_C + esc.SPAN_C * output) * 100.0)
+        v[_RPM_1 + i] = round(esc.RPM * output)
+        # As PX4 has it: armed, a motor draws its idle current, turning or not.
+        idle_a = esc.IDLE_A if told and armed else 0.0
+        v[_AMPERE_1 + i] = esc.current_a(output) if output > 0.0 else idle_a
+    v[_VOLT] = row.battery[0]
+
+
+@kernel
+def _goal(v: Vector, context: Vector) -> None:
+    """Write where an automatic mode is going."""
+    north, east, down = context[_GOAL], context[_GOAL + 1], context[_GOAL + 2]
+    v[_GOAL_KNOWN] = 0.0
+    if math.isfinite(north) and math.isfinite(east) and math.isfinite(down):
+        origin = Geodetic(context[_LATITUDE], context[_LONGITUDE], context[_ORIGIN_M])
+        place = local_to_geodetic(context[_GOAL:_FIX], origin)
+        v[_GOAL_KNOWN], v[_GOAL_KNOWN + 3] = 1.0, place.altitude_m
+        v[_GOAL_KNOWN + 1] = units.deg_e7(place.latitude_deg)
+        v[_GOAL_KNOWN + 2] = units.deg_e7(place.longitude_deg)
+    v[_GOAL_KNOWN + 4] = v[_SP_YAW]
+
+
+@kernel
+def _fix(v: Vector, row: Fields, context: Vector) -> None:
+    """Write the newest GPS fix."""
+    v[_FIX_KNOWN] = 0.0
+    if math.isnan(context[_FIX]):
+        return
+    north, east = row.gps_velocity[0], row.gps_velocity[1]
+    place = local_to_geodetic(row.gps_position, HOME)
+    v[_FIX_KNOWN], v[_FIX_KNOWN + 1] = 1.0, context[_FIX]
+    v[_FIX_KNOWN + 2] = units.deg_e7(place.latitude_deg)
+    v[_FIX_KNOWN + 3] = units.deg_e7(place.longitude_deg)
+    v[_FIX_KNOWN + 4] = units.mm(place.altitude_m)
+    v[_FIX_KNOWN + 5] = units.uint16(math.hypot(north, east) * 100.0)
+    v[_FIX_KNOWN + 6] = units.centidegrees(math.atan2(east, north))
+    v[_FIX_KNOWN + 7] = units.saturate(context[_FIX + 1], 0, 254, 255)
+    v[_FIX_KNOWN + 8] = units.uint32(context[_FIX + 2] * 1e3)
+    v[_FIX_KNOWN + 9] = units.uint32(context[_FIX + 3] * 1e3)
+
+
 @large_kernel
 def _sources(v: Vector, row: Fields, context: Vector) -> None:
     """Write the sources (len(_SOURCES),) of a tick's log."""
     s = row.state
     v[_ZERO], v[_NAN], v[_ONE], v[_HEALTHY] = 0.0, math.nan, 1.0, row.healthy
     v[_TIME_US], v[_TIME_US + 1] = row.time_us, units.boot_ms(row.time_us)
+    v[_TIME_US + 2] = row.time_us * NS_PER_US
     v[_PWM_1 + 4], v[_LOCAL_NED], v[_LOCAL_NED + 1] = _PWM_DISARMED, _FRAME, _AUTOPILOT
+    v[_LOCAL_NED + 2], v[_LOCAL_NED + 3], v[_LOCAL_NED + 4] = _GLOBAL_INT, 4.0, _PPM
+    v[_LOCAL_NED + 5], v[_LOCAL_NED + 6] = 0b1111, units.UINT16_MAX
     _estimated(v, s)
     for i in range(3):
         v[_AX + i] = row.accel[i] - s[es.ACCEL_BIAS + i]
@@ -347,6 +454,9 @@ def _sources(v: Vector, row: Fields, context: Vector) -> None:
     v[_PRESSURE + 2], v[_PRESSURE + 3] = row.temperature_c, _IMU_FIELDS
     _placed(v, s, pressure_alt, context)
     _wanted(v, row, context)
+    _goal(v, context)
+    _fix(v, row, context)
+    _speed_controllers(v, row, context)
 
 
 (_ZERO, _NAN, _ONE, _HEALTHY, _LOCATED, _TIME_US, _ROLL, _QW, _P, _X, _VX, _VAR_X, _VAR_ROLL) = (
@@ -373,10 +483,15 @@ def _sources(v: Vector, row: Fields, context: Vector) -> None:
 (_SP_X, _SP_VX, _SP_AX, _SP_YAW, _PWM_1, _LOCAL_NED) = (
     _AT[name] for name in ("sp_x", "sp_vx", "sp_ax", "sp_yaw", "pwm_1", "local_ned")
 )
+(_GOAL_KNOWN, _FIX_KNOWN, _ESC_CDEG_1, _RPM_1, _VOLT, _AMPERE_1) = (
+    _AT[name] for name in ("goal_known", "fix_known", "esc_cdeg_1", "rpm_1", "volt", "ampere_1")
+)
 _X_IGNORE: int = dialect.POSITION_TARGET_TYPEMASK_X_IGNORE
 _VX_IGNORE: int = dialect.POSITION_TARGET_TYPEMASK_VX_IGNORE
 _FRAME: int = dialect.MAV_FRAME_LOCAL_NED
 _AUTOPILOT: int = dialect.MAV_ESTIMATOR_TYPE_AUTOPILOT
+_GLOBAL_INT: int = dialect.MAV_FRAME_GLOBAL_INT
+_PPM: int = dialect.ESC_CONNECTION_TYPE_PPM
 
 
 # --- frames

@@ -178,14 +178,13 @@ class SimulatedCamera:
         is kept on average. Slots that were missed are left out.
 
         It is exposed at simulated `time_us` [µs], which is the middle of an exposure that takes
-        time, from where the vehicle is then. The images are drawn when they are read, unless one
-        of them depends on the one before.
+        time, from where the vehicle is then; `motion` is kept, not copied. The images are drawn
+        when they are read, unless one of them depends on the one before.
         """
         elapsed_us = time_us - self._start_us
         self._rate.due(elapsed_us)
         self.next_us = self._start_us + math.ceil(self._rate.next_us)
-        # The vehicle flies on in the same arrays.
-        seen = elapsed_us, Motion(*map(np.array, motion)), self._seed, self._rate.period
+        seen = elapsed_us, motion, self._seed, self._rate.period
 
         def draw() -> Mapping[str, FurtherImage]:
             return {name: each.take(*seen) for name, each in self._eyes.items()}
@@ -202,6 +201,8 @@ class CameraServer:
 
     Publishing does not block: a slow or stopped companion cannot hold the simulator.
     """
+
+    awaited = True
 
     def __init__(
         self, endpoint: str, context: zmq.Context[zmq.Socket[bytes]] | None = None

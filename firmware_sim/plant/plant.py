@@ -20,7 +20,7 @@ from airl_mav.vehicle.rotor import lag
 from airl_mav.vehicle.wind import Wind
 from firmware_sim.engine.dynamics import Speeds, pack_row, supply
 from firmware_sim.engine.kinematics import POSITION, QUATERNION, RATES, VELOCITY
-from firmware_sim.engine.record import IDLE, Record, new_aircraft
+from firmware_sim.engine.record import Record, new_aircraft
 from firmware_sim.engine.ticks import (
     COLLIDED,
     DETECTED,
@@ -50,7 +50,10 @@ REST_SPEED_M_S = 0.1
 """Touching the floor slower than this is resting, no collision (AirSim's kRestingVelocityMax)."""
 
 STILL = 1e-4
-"""A vehicle rests below this speed [m/s], turn rate [rad/s] and share of the rotors' full speed."""
+"""A vehicle rests below this speed [m/s] and turn rate [rad/s]."""
+
+NEVER_US = 1 << 61
+"""Begin of the tours of obstacles that stand still [µs]."""
 
 STOPPED: Speeds = (0.0, 0.0, 0.0, 0.0)
 
@@ -142,6 +145,8 @@ class Plant:
             ("start_us", start_us),
             ("moves_us", start_us),
             ("closing_m_s", self._room.closing_m_s),
+            ("footing_m", 0.5 * profile.body.width_m),
+            ("held", 1),
             ("time_us", start_us),
             ("charge", asked.battery_charge),
             ("power_w", power_w),
@@ -185,7 +190,11 @@ class Plant:
     @property
     def _elapsed_us(self) -> int:
         """How long what moves has been under way [µs]."""
-        return self.record["time_us"].item(0) - self.record["moves_us"].item(0)
+        return max(0, self.record["time_us"].item(0) - self.record["moves_us"].item(0))
+
+    def hold_obstacles(self) -> None:
+        """Keep what moves where its tours begin, until `begin`."""
+        self.record["moves_us"] = NEVER_US
 
     def begin(self) -> None:
         """Let what moves set out now; contacts so far are forgotten."""
@@ -236,8 +245,6 @@ class Plant:
             How many ticks are complete, and the event that ended them (`engine.ticks`).
         """
         done = 0
-        if self.record["resting"][0] and controller["demand_kind"][0] != IDLE:
-            self.record["resting"], self.record["room_m"] = 0, -math.inf
         while True:
             inertial, compass, barometer, gps = self._sensors.noise
             told = stretch(
@@ -285,7 +292,7 @@ class Plant:
                 return k + 1, event
             if not self._touching and self._measure_room():
                 return k + 1, NONE
-            if controller["demand_kind"][0] == IDLE and self._has_come_to_rest():
+            if record["held"][0] and self._has_come_to_rest():
                 return k + 1, NONE
         return ticks, NONE
 
@@ -324,15 +331,15 @@ class Plant:
         return self.sense()
 
     def _move(self, motors: Speeds, wind: Vector) -> None:
-        record, stopped = self.record, motors == STOPPED
-        if stopped and record["resting"][0] and record["room_m"][0] > ROOM_M:
-            rest_record(record, wind)
-            return
+        record = self.record
         # An empty battery turns no motor.
         motors = motors if record["charge"][0] > 0.0 else STOPPED
+        if record["resting"][0] and record["room_m"][0] > ROOM_M and record["held"][0]:
+            rest_record(record, motors, wind)
+            return
         after = self._moved(*push_record(record, motors, wind))
         finish_record(record, after, wind, bool(self._touching))
-        if stopped:
+        if record["held"][0]:
             self._has_come_to_rest()
 
     def _moved(self, here: Vec, force: Vec, torque: Vec) -> Vector:
@@ -345,7 +352,7 @@ class Plant:
             body.look_around()
         ticks, rate_hz = record["ticks"].item(0) + 1, record["rate_hz"].item(0)
         time_us = record["start_us"].item(0) + ticks * US_PER_S // rate_hz
-        after = body.move(here, force, torque, before, time_us - record["moves_us"].item(0))
+        after = body.move(here, force, torque, before, max(0, time_us - record["moves_us"].item(0)))
         if body.touch.close or self._touching:
             self._watch(body.touch, before, time_us)
         record["room_m"], record["resting"] = -math.inf, 0
@@ -355,7 +362,7 @@ class Plant:
         """Let the vehicle rest where it stands on the floor alone; return whether it does."""
         record, motion = self.record, self._motion
         names = [self.body.names[other] for other in self._touching]
-        if names != [FLOOR] or np.maximum.reduce(record["speeds"][0]) > STILL:
+        if names != [FLOOR]:
             return False
         if np.maximum.reduce(np.abs(motion[[3, 4, 5, 10, 11, 12]])) > STILL:
             return False

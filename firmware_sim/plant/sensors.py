@@ -49,13 +49,10 @@ class Rate:
             return False
         period = int(time_us * self._rate_hz / US_PER_S)
         # Rounding may put a time that lies on a boundary into the period before it.
-        if self._start_us(period + 1) <= time_us:
+        if (period + 1) * US_PER_S / self._rate_hz <= time_us:
             period += 1
-        self.period, self.next_us = period, self._start_us(period + 1)
+        self.period, self.next_us = period, (period + 1) * US_PER_S / self._rate_hz
         return True
-
-    def _start_us(self, period: int) -> float:
-        return period * US_PER_S / self._rate_hz
 
 
 class White:

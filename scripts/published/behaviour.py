@@ -163,7 +163,7 @@ def _fly(scenario: Scenario) -> FlownEpisode:
 def sample(flown: FlownEpisode) -> FlightSample:
     """Return what is written down of a flight: from the start of navigation to the verdict."""
     record, path = flown.record, flown.trajectory
-    start_us = record.started_us if record.navigation_us is None else record.navigation_us
+    start_us = record.zero_us
     times_us = np.arange(start_us, record.ended_us + 1, SAMPLE_EVERY_US)
     columns = [np.interp(times_us, path.time_us, column) for column in path.position.T]
     energy_j = None if record.quality is None else record.quality.total_energy_j

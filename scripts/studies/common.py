@@ -108,7 +108,7 @@ def fly(
 
 def aside(path: Trajectory, episode: EpisodeRecord) -> float:
     """Return the greatest distance of a path from the line through start and goal [m]."""
-    start_us = episode.started_us if episode.navigation_us is None else episode.navigation_us
+    start_us = episode.zero_us
     north, east = np.array(episode.goal) / np.linalg.norm(episode.goal)
     position = path.between(start_us, episode.ended_us).position
     return float(np.abs(position[:, :2] @ np.array([-east, north])).max(initial=0.0))

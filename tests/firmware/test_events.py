@@ -375,8 +375,8 @@ def test_a_pilot_who_is_heard_no_more_is_told_by_events_alone() -> None:
 def test_a_sensor_that_falls_silent_is_an_event() -> None:
     found = []
     for kind in (ACCEL, GYRO, MAG, BARO, GPS):
-        watch = SensorWatch(kind, np.zeros(3, np.int64))  # it has measured once, at 0
-        message = watch.judge(2 * US_PER_S, flying=True)
+        times_us = np.zeros(3, np.int64)  # it has measured once, at 0
+        message = SensorWatch(kind, times_us).judge(2 * US_PER_S, times_us.tolist(), flying=True)
         assert message is not None and message.text == f"{kind.name} #0 failed: TIMEOUT!"
         found.append(None if message.event is None else read(message.event)[0])
     assert found == [

@@ -324,7 +324,9 @@ def frames_of(
     simulation = Simulation(setup, start_us=0, clock=SimClock(), autopilot=Witness())
     frames: list[tuple[int, Frame]] = []
     for _ in range(500):
-        simulation.capture_due(lambda frame: frames.append((simulation.time_us, frame)))
+        simulation.capture_due(
+            simulation.time_us, lambda frame: frames.append((simulation.time_us, frame))
+        )
         simulation.tick()
     simulation.close()
     return frames

@@ -66,7 +66,7 @@ def apart(plants: list[Plant]) -> float:
 
 
 def test_on_the_floor_it_moves_as_pybullet_s_body() -> None:
-    """It settles, shifts under unequal rotors, tips up, and falls back."""
+    """It settles, stands with unequal rotors, tips up, and falls back."""
     tilt = 0.0
     with both() as plants:
         for motors, ticks in (
@@ -82,7 +82,7 @@ def test_on_the_floor_it_moves_as_pybullet_s_body() -> None:
                 turned = Rotation.from_quat(plants[1].motion[[7, 8, 9, 6]])
                 tilt = max(tilt, float(turned.magnitude()))
     assert tilt > math.radians(15.0)
-    assert float(turned.magnitude()) < math.radians(0.1)
+    assert float(turned.magnitude()) < math.radians(0.2)
 
 
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.nightly)])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from firmware_sim.autopilot.autopilot_state import Mode
 from firmware_sim.autopilot.failsafes.motor_failure import MotorFailure, Undercurrent
 from firmware_sim.faults.actuation import slowed, weakened
 from firmware_sim.interfaces import ActuatorControls
-from firmware_sim.mavlink.streams.actuators import esc_status
+from firmware_sim.mavlink.telemetry import payload
 from tests.firmware.test_fault_parts import witnessed
 from tests.support.flight_rig import flight, quad
 
@@ -112,10 +113,10 @@ def test_a_motor_that_stops_in_flight_is_told_and_acted_on(enabled: bool) -> Non
         began_s = rig.time_s
         rig.run(0.4)
         assert (rig.mode is Mode.LAND) is enabled
-        status = esc_status(rig.ap.state())
-        rpm, current_a = status[2:6], status[10:14]
-        assert rpm[0] == 0
-        assert current_a[0] == 0.0
+        status = payload("ESC_STATUS", rig.ap.state()) or b""
+        rpm, current_a = struct.unpack_from("<8xi28xf", status.ljust(57, b"\0"))
+        assert rpm == 0
+        assert current_a == 0.0
         if enabled:
             after_s = rig.said("Preflight Fail: Motor failure detected") - began_s
             assert 0.1 < after_s < 0.25, "FD_ACT_MOT_TOUT, and a look at 10 Hz"

@@ -73,7 +73,7 @@ def flown(simulation: Simulation, *, land: bool = False) -> list[bytes]:
         seen += [simulation.plant.motion.tobytes(), state.accel.tobytes(), state.mag.tobytes()]
         seen += [each.tobytes() for each in state.estimate if isinstance(each, np.ndarray)]
         seen += [repr((state.status, state.battery, state.motors, state.health)).encode()]
-        simulation.capture_due(images.append)
+        simulation.capture_due(simulation.time_us, images.append)
     seen += [frame.image.tobytes() for frame in images]
     return seen + [array.tobytes() for array in simulation.arrays().values()]
 

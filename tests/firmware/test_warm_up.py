@@ -27,7 +27,7 @@ with flight(1, vehicle=vehicle) as rig:
     if vehicle.told_origin is not None:
         rig.ap.set_origin(vehicle.told_origin)
     rig.run(5.0)
-    rig.sim.capture_due(lambda frame: None)
+    rig.sim.capture_due(rig.sim.time_us, lambda frame: None)
     rig.take_off(2.5)
     rig.go_offboard(velocity_setpoint(2.0, 0.0, 0.0))
     rig.run(2.0)

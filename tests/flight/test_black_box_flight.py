@@ -32,7 +32,7 @@ from airl_mav.core.frames import quat_yaw
 from airl_mav.experiments.refly import FLOWN, REHEARSED, from_its_start, refly
 from airl_mav.experiments.run import Run, load_run
 from airl_mav.flight.judge import Outcome
-from airl_mav.flight.setup import Setup
+from airl_mav.flight.record import Setup
 from airl_mav.latency.stamps import STAMPS
 from airl_mav.lockstep.stage import Stage
 from airl_mav.report.comparison.runs import compare_folders

@@ -22,7 +22,7 @@ from airl_mav.lockstep.stage import Stage
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.episode import faults_of
 from airl_mav.rehearsal.run_folder import load
-from airl_mav.report.faults import faults_table
+from airl_mav.report.run_tables import faults_table
 from airl_mav.scenario.file import read_scenario_file
 from airl_mav.scenario.model import Scenario
 from firmware_sim.simulation import EpisodeSetup

@@ -146,7 +146,7 @@ def test_a_stopped_run_goes_on_where_it_was(
     assert asked == ["gyro off"]
     found = fault_matrix.load(tmp_path / "faults.json")
     assert [cell.fault for cell in found.cells] == ["accel off", "gyro off"]
-    monkeypatch.setattr(faults, "vehicle_digest", lambda _: "another")
+    monkeypatch.setattr(fault_matrix, "vehicle_digest", lambda _: "another")
     with pytest.raises(UsageError, match="another vehicle"):
         faults.run(options("gyro off"))
     (tmp_path / "faults.json").write_text("{}")

@@ -28,9 +28,9 @@ from airl_mav.policy.observation import Observation
 from airl_mav.rehearsal.run_folder import load
 from airl_mav.scenario.model import LimitSettings, PilotSettings, WatchdogSettings
 from companion.camera import ZmqFrameSource
-from companion.guard import ThreadGuard
 from companion.mavsdk_link import MavsdkLink
 from companion.mission import MissionResult, fly_mission
+from companion.watchdog import ThreadGuard
 from tests.support.ports import LOOPBACK, TestPorts, choose_ports, free_ports
 from tests.support.processes import (
     HOLD,

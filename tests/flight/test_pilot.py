@@ -25,10 +25,9 @@ from airl_mav.policy.actions import ALTITUDE_P, MAX_VERTICAL_M_S, Action
 from airl_mav.policy.observation import Kinematics, Observation
 from airl_mav.scenario.model import PilotSettings, WatchdogSettings
 from companion.camera import ReceivedFrame
-from companion.guard import ThreadGuard
 from companion.interfaces import STOP, BodyVelocity, LinkError, Setpoint, VehicleStatus
 from companion.pilot import Pilot
-from companion.watchdog import Watchdog
+from companion.watchdog import ThreadGuard, Watchdog
 
 LENS = Intrinsics.from_fov(8, 6, math.radians(90.0))
 FAR = (1000.0, 0.0)

@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 
 from airl_mav.camera.frame import Frame, FurtherImage, depth_to_z16
 from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.cli.video import video_words
 from airl_mav.core.clock import WallClock
 from airl_mav.core.errors import EXIT_INTERRUPTED, FieldError, UsageError
 from airl_mav.profiles.vehicle import load_vehicle
-from airl_mav.rehearsal.video import video_words
 from airl_mav.scenario.model import Scenario
 from companion.video import GIMBAL_PORT, RtpVideo, Watcher, picture_of, picture_size
 from companion.video_program import ShownCamera, show_video

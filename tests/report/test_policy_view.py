@@ -54,7 +54,9 @@ def compensated(tmp_path_factory: pytest.TempPathFactory, linear: Path) -> Loade
 
 def test_the_policy_asked_again_chooses_what_it_flew(flown: LoadedRun) -> None:
     decisions = seen_in(flown)
-    assert len(decisions) == sum(len(s["sent_us"]) for s in flown.latency.values())
+    # Those after the outcome are no part of the flight.
+    sent = ((flown.latency[e.index]["sent_us"], e.ended_us) for e in flown.episodes)
+    assert len(decisions) == sum(int((times <= end_us).sum()) for times, end_us in sent)
     assert len({int(np.argmax(d.scores)) for d in decisions if d.scores is not None}) > 2
     # Frames were exposed between the samples of the path, 20 ms apart.
     again = [d.again for d in decisions]

@@ -20,26 +20,26 @@ from airl_mav.latency.injection import NOTHING_INJECTED
 from airl_mav.latency.stages import SHOWN_STAGES
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.run_folder import LoadedRun, RunFolder, load
-from airl_mav.report.ages import ages_table, run_ages
 from airl_mav.report.conduct import conduct_table
 from airl_mav.report.energy import energy_flights_table, energy_table, flight_energies
-from airl_mav.report.flight_data import unpacked
 from airl_mav.report.forensics.worst import examine_worst
+from airl_mav.report.measures import summarize_run
 from airl_mav.report.run_page import build_page
 from airl_mav.report.run_report import print_report, verdict_of
-from airl_mav.report.run_summary import summarize_run
 from airl_mav.report.run_tables import (
+    ages_table,
     episodes_table,
     latency_table,
     quality_table,
     real_time_table,
+    run_ages,
 )
 from airl_mav.report.scene import plotly_script
 from airl_mav.report.shown_flights import MAX_PICTURED
 from airl_mav.report.table import TableView
 from airl_mav.report.theme import DARK
 from airl_mav.report.timeline import slowest_table, timeline_of
-from tests.support.page_alone import page_alone
+from tests.support.page_alone import page_alone, unpacked
 from tests.support.run_demo import OUTCOMES_SEEN, demo_setup, write_demo_run
 
 VOID = {"meta", "img", "br", "link", "input", "hr"}

@@ -21,7 +21,7 @@ from firmware_sim.mavlink.codec import Values, WireMessage, dialect
 from firmware_sim.mavlink.endpoint import UdpEndpoint
 from firmware_sim.mavlink.event_buffer import EventBuffer
 from firmware_sim.mavlink.link import Link, LinkConfig
-from firmware_sim.mavlink.services import commands, handle, peers
+from firmware_sim.mavlink.services import commands, handle
 from firmware_sim.mavlink.services.command import Command
 from firmware_sim.mavlink.services.context import Context, for_vehicle, sender
 from firmware_sim.mavlink.streams import BUILDERS, Builder, status
@@ -57,7 +57,7 @@ class Manners:
         self.copter = copter
         builders: dict[str, Builder | None] = {
             **BUILDERS,
-            "TIMESYNC": peers.timesync_request,
+            "TIMESYNC": None,
             "HEARTBEAT": self._heartbeat,
             "SYS_STATUS": self._sys_status,
             "EXTENDED_SYS_STATE": lambda state: (3, _LANDED[state.status.landed]),

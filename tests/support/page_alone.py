@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import gzip
 import io
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -27,3 +29,8 @@ def page_alone() -> Iterator[None]:
 
     with patch.object(theme, "render_png", settled):
         yield
+
+
+def unpacked(data: str) -> str:
+    """Return the text that `flight_data.packed` was given."""
+    return gzip.decompress(base64.b64decode(data)).decode()

@@ -19,5 +19,6 @@ def record_tick(
     keep: bool = False,
 ) -> None:
     """Hand the state after a tick to a recorder; `keep` it even between samples."""
-    if recorder.integrate(time_us, power_w) or keep:
-        recorder.keep(np.concatenate([position, velocity, quaternion]).astype(np.float64))
+    state = np.concatenate([position, velocity, quaternion]).astype(np.float64)
+    if not recorder.extend([time_us], [power_w], state[None]) and keep:
+        recorder.keep(state)

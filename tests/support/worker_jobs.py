@@ -17,7 +17,7 @@ from airl_mav.experiments.executors import Stop
 from airl_mav.experiments.process_executor import ProcessExecutor
 
 if TYPE_CHECKING:  # a second of imports in every worker
-    from airl_mav.experiments.flier import FlyEpisodes
+    from airl_mav.experiments.executors import FlyEpisodes
     from airl_mav.rehearsal.run_folder import FlownEpisode, RunFolder
     from airl_mav.scenario.resolved import PlannedEpisode
 

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from airl_mav.black_box.channels import foxglove_schema
 from airl_mav.black_box.messages import (
     SCHEMAS,
     TOPICS,
@@ -27,6 +26,7 @@ from airl_mav.black_box.messages import (
     Status,
     Telemetry,
     Truth,
+    foxglove_schema,
     image_message,
     image_of,
     text,

@@ -24,7 +24,7 @@ from airl_mav.latency.clock_offset import (
     best_reading,
     relate,
 )
-from companion.timesync import TimesyncLink
+from airl_mav.profiling.hil import TimesyncLink
 from tests.support.mavlink_clients import wait_for
 from tests.support.ports import LOOPBACK, free_ports
 

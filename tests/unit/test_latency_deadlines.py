@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from airl_mav.latency.deadlines import ages_at_effect, deadline_miss_ratio
+from airl_mav.latency.stages import ages_at_effect, deadline_miss_ratio
 from airl_mav.latency.stamps import NO_STAMP
 
 

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from airl_mav.flight.statistics import median_of
-from airl_mav.latency.series import FENCE_SAMPLES, decision_series, fence
-from airl_mav.latency.stages import stage_samples
+from airl_mav.latency.stages import FENCE_SAMPLES, decision_series, fence, stage_samples
 from airl_mav.latency.stamps import NO_STAMP
 
 COLUMNS = (

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from airl_mav.latency.matching import SAME_WITHIN, UNMATCHED, match_setpoints, stamps_of
 from airl_mav.latency.stages import SHOWN_STAGES, STAGES, pool, stage_samples
 from airl_mav.latency.stamps import NO_STAMP
+from airl_mav.rehearsal.episode import SAME_WITHIN, UNMATCHED, match_setpoints, stamps_of
 
 CHAIN = ("t1", "wait", "t2", "send", "link", "control")
 

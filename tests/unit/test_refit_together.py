@@ -11,7 +11,7 @@ import pytest
 from airl_mav.cli.main import main
 from airl_mav.core.errors import FieldError
 from airl_mav.flight.statistics import QUANTILE
-from airl_mav.refitting.quantity import FittedQuantity, unobserved
+from airl_mav.refitting.quantity import FittedQuantity
 from airl_mav.refitting.together import pooled, random_effects, refit_together
 
 
@@ -48,7 +48,7 @@ def test_intervals_hold_the_truth_where_flights_differ() -> None:
 
 
 def test_what_one_flight_tells_is_known_and_what_none_tells_is_not() -> None:
-    nothing = unobserved("k", "drag", "1/s", "too slow", 0.2)
+    nothing = FittedQuantity("k", "drag", "1/s", unobservable="too slow", profile=0.2)
     one = pooled([nothing, told(0.3, 0.01)])
     assert (one.value, one.half_width) == pytest.approx((0.3, QUANTILE * 0.01))
     assert one.source == "1 of 2 flights: a log"

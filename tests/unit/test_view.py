@@ -22,8 +22,8 @@ from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape, Tour
 from airl_mav.cli.evaluate import EvaluateOptions
 from airl_mav.cli.evaluate import run as evaluate
 from airl_mav.cli.options import check_installed, read_options
+from airl_mav.cli.shared_options import view_of
 from airl_mav.cli.sitl import SitlOptions
-from airl_mav.cli.viewing import view_of
 from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import CommandKind
 from airl_mav.core.errors import FieldError, UsageError
@@ -614,7 +614,7 @@ def test_hills_are_told_and_shown_as_they_are() -> None:
 
 def test_walls_are_seen_from_inside() -> None:
     pytest.importorskip("viser")
-    from airl_mav.view.look import walls
+    from airl_mav.view.style import walls
 
     inside = np.array([10.0, 0.0, -2.0])
     for ceiling, count in ((False, 8), (True, 10)):

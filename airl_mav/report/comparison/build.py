@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from airl_mav.flight.record import EpisodeRecord, run_sha256
 from airl_mav.flight.statistics import aggregate
 from airl_mav.latency.percentiles import summarize
 from airl_mav.latency.stages import ALL_STAGES, Samples, pool, stage_samples
-from airl_mav.rehearsal.run_folder import LoadedRun, load
+from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report.comparison import model
 from airl_mav.report.run_tables import setup_rows
 
@@ -41,19 +40,7 @@ def compare(
     facts: Mapping[str, Any] | None = None,
     entries: Sequence[model.RunEntry] = (),
 ) -> model.Comparison:
-    """Compare runs.
-
-    Args:
-        runs: Runs by name, in the order of the tables.
-        contrasts: Names of run and reference; None = every run against the first.
-        kind: Kind of comparison; prefix of its files.
-        title: One line.
-        facts: Settings of the comparison.
-        entries: Descriptions of the runs; empty = their names only.
-
-    Raises:
-        UsageError: There is no run, a run holds no flight, or a seed twice.
-    """
+    """Compare runs, in the order of the tables; without contrasts each with the first."""
     if not runs:
         raise UsageError(f"no run here; accepted: a {kind} of one run or more")
     by_name = {entry.name: entry for entry in entries}
@@ -78,11 +65,6 @@ def compare(
         runs=compared,
         contrasts=tuple(_contrast(entry, runs, figures) for entry in contrasts),
     )
-
-
-def load_runs(folder: Path, entries: Iterable[model.RunEntry]) -> dict[str, LoadedRun]:
-    """Read the runs of a comparison that lies in a folder, by name. Raises UsageError."""
-    return {entry.name: load(folder / entry.folder) for entry in entries}
 
 
 def tests_of(run: LoadedRun) -> list[EpisodeRecord]:

@@ -88,10 +88,7 @@ FEWEST = 10
 def build_degradation(
     facts: Mapping[str, Any], entries: Sequence[RunEntry], runs: Mapping[str, LoadedRun]
 ) -> Comparison:
-    """Return a degradation curve for every policy; see `show.build_comparison`.
-
-    Entries are sorted by policy (`group`), then by latency (`label`), the reference first.
-    """
+    """Return a degradation curve for every policy (`group`), by growing latency (`label`)."""
     contrasts: list[ContrastEntry] = []
     for policy in dict.fromkeys(entry.group for entry in entries):
         line = [entry for entry in entries if entry.group == policy]

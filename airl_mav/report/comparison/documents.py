@@ -79,10 +79,7 @@ def comparison_document(
     lead: str = "",
     facts_title: str = "What flew",
 ) -> Document:
-    """Return the document of a comparison; its parts are those of `Document`.
-
-    Links to the runs are relative to `folder`. The date is added to the `kicker`.
-    """
+    """Return the document of a comparison, dated, with links to the runs relative to `folder`."""
     first = comparison.runs[0]
     made = runs[first.name].info
     created = made.created_utc.replace("T", " ").replace("+00:00", " UTC")

@@ -229,16 +229,10 @@ def flight_panels(
     return panels
 
 
-def seed_pictures(
-    prefix: str, compared: Sequence[ComparedRun], runs: Runs, seeds: Sequence[int]
-) -> list[theme.Picture]:
-    """Draw the flights of several runs from above, one picture a seed."""
-    return [_seed_picture(f"{prefix}-{seed}", compared, runs, seed) for seed in seeds]
-
-
-def _seed_picture(
+def seed_picture(
     name: str, compared: Sequence[ComparedRun], runs: Runs, seed: int
 ) -> theme.Picture:
+    """Draw the flights of a seed by several runs from above."""
     figure = theme.new_figure(4.2, 4.6)
     ax: Axes = figure.subplots()
     flights = [

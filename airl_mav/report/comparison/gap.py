@@ -14,7 +14,7 @@ from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report import measures
 from airl_mav.report.comparison.build import compare
 from airl_mav.report.comparison.documents import comparison_document, worst_seeds
-from airl_mav.report.comparison.figures import contrast_pictures, flight_panels, seed_pictures
+from airl_mav.report.comparison.figures import contrast_pictures, flight_panels, seed_picture
 from airl_mav.report.comparison.model import (
     ComparedRun,
     Comparison,
@@ -162,10 +162,7 @@ several runs: one for each source of latency."""
 def build_gap(
     facts: Mapping[str, Any], entries: Sequence[RunEntry], runs: Mapping[str, LoadedRun]
 ) -> Comparison:
-    """Return the gaps beside published ones, the worst seeds and the verdict.
-
-    See `show.build_comparison`. Each entry has its `role`; its `group` is the arena.
-    """
+    """Return the gaps by `role` and arena (`group`) beside published ones, and the worst seeds."""
     contrasts = [
         replace(kind, target=target.name, reference=reference.name)
         for group in dict.fromkeys(entry.group for entry in entries)
@@ -392,7 +389,7 @@ def _arena_sections(
             Section(
                 "Seeds that lost most",
                 3,
-                draw=lambda: seed_pictures(f"worst-{name}", drawn, runs, worst),
+                draw=lambda: [seed_picture(f"worst-{name}-{s}", drawn, runs, s) for s in worst],
                 sheet=f"worst-{name}.png",
                 note=f"{key}. Of the seeds with which the reference reached the goal: first ones "
                 "that failed on the target, then those that took longest against the reference. "

@@ -16,7 +16,7 @@ from airl_mav.report.comparison.figures import contrast_pictures
 from airl_mav.report.comparison.model import ComparedRun, Comparison, Contrast, RunEntry
 from airl_mav.report.document import Document, Section
 from airl_mav.report.measures import MEASURES, count_successes
-from airl_mav.report.table import NONE, OUTCOME_LABELS, Column, TableView, ms
+from airl_mav.report.table import NONE, OUTCOME_LABELS, Column, TableView, columns_of, ms
 
 MAX_SPLIT = 50
 """Seeds in the table of flights that did not end alike."""
@@ -39,15 +39,9 @@ def build_ladder(
 
 def start_table(comparison: Comparison) -> TableView:
     """Return where navigation begins at each level, and how well the place is known."""
-    columns = (
-        Column("level", number=False),
-        Column("flights"),
-        Column("take-off", "s"),
-        Column("its energy", "kJ"),
-        Column("aside", "m"),
-        Column("height", "m"),
-        Column("speed", "m/s"),
-        Column("position error", "m"),
+    columns = columns_of(
+        "<level | flights | take-off [s] | its energy [kJ] | "
+        "aside [m] | height [m] | speed [m/s] | position error [m]"
     )
     notes = (
         "Means. Take-off: before navigation, in none of the figures above. Aside, height, speed: "

@@ -13,9 +13,8 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.progress import DRAWING, Progress
 from airl_mav.flight.requirements import Requirement, find, settle
 from airl_mav.flight.statistics import reached_goals
-from airl_mav.rehearsal.run_folder import LoadedRun
+from airl_mav.rehearsal.run_folder import LoadedRun, load
 from airl_mav.report.comparison import degradation, gap, ladder, matrix, model, runs
-from airl_mav.report.comparison.build import load_runs
 from airl_mav.report.document import Document, print_document, print_place, write_document
 from airl_mav.report.verdict import (
     OverallVerdict,
@@ -30,7 +29,7 @@ from airl_mav.report.verdict import (
 Runs = Mapping[str, LoadedRun]
 
 FLOWN_UNTIL = "flown_until"
-"""Fact of a comparison whose flights were added until the success rate was decided: the rate is
+"""Fact of a comparison whose flights were added until the success rate was decided. The rate is
 judged by the test that they were stopped by."""
 
 _BUILD: dict[
@@ -55,18 +54,8 @@ _DOCUMENT: dict[model.Kind, Callable[[model.Comparison, Runs, Path], Document]] 
 def build_comparison(
     folder: Path, kind: model.Kind, facts: Mapping[str, Any], entries: Sequence[model.RunEntry]
 ) -> tuple[model.Comparison, dict[str, LoadedRun]]:
-    """Read runs and compare them as a kind of comparison does.
-
-    Args:
-        folder: Folder of the comparison, which contains the runs.
-        kind: Kind; its module documents the facts and entries that it needs.
-        facts: Settings that all runs share.
-        entries: The runs, in the order of the tables.
-
-    Raises:
-        UsageError: There is no run, one cannot be read, or holds no flight.
-    """
-    loaded = load_runs(folder, entries)
+    """Read the runs of a folder and compare them; the kind's module documents its facts."""
+    loaded = {entry.name: load(folder / entry.folder) for entry in entries}
     return _BUILD[kind](facts, entries, loaded), loaded
 
 
@@ -84,9 +73,8 @@ def judge_comparison(
 ) -> OverallVerdict:
     """Return the verdict of a comparison; FieldError if a gap is required without any reference.
 
-    A hardware gap is judged by the run to deploy: the mitigated policy on the onboard computer if
-    flown, otherwise the policy itself. In other comparisons every run must meet the requirements; a
-    required gap applies to runs with a reference.
+    A hardware gap is judged by the run to deploy. That is the mitigated policy on the onboard
+    computer if flown, otherwise the policy. In other comparisons every run is judged.
     """
     against = {c.entry.target: c for c in reversed(comparison.contrasts)}
     if not against and (gaps := [each for each in requirements if each.gap]):
@@ -134,17 +122,7 @@ def write_comparison(
     folder: Path,
     verdict: OverallVerdict | None = None,
 ) -> Path:
-    """Write `<kind>.json`, `verdict.json`, `.html`, `.md` and PNG files; return the page's path.
-
-    Args:
-        comparison: The comparison.
-        loaded: Its runs by name, for the pictures.
-        folder: Output folder.
-        verdict: Verdict of the page; None = judged by the folder's last requirements.
-
-    Raises:
-        UsageError: The folder cannot be written.
-    """
+    """Write `<kind>.json`, `verdict.json`, `.html`, `.md` and PNG files; return the page's path."""
     return write_document(_saved(comparison, loaded, folder, verdict), folder)
 
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import foxglove
 from foxglove.websocket import ChannelView, Client, ServerListener
 
-from airl_mav.black_box.channels import Channel
+from airl_mav.black_box.messages import Channel
 from airl_mav.core.clock import NS_PER_US, Clock, WallClock
 from airl_mav.core.errors import FieldError
 from airl_mav.core.ports import LOOPBACK
@@ -82,10 +82,7 @@ class LiveFlight(ServerListener):
         channel.log(data, log_time=time_ns)
 
     def wait(self, timeout_s: float | None = None) -> bool:
-        """Wait until a viewer has subscribed to its topics; return whether there is one.
-
-        Viewers subscribe topic by topic; a message sent before the subscription is lost.
-        """
+        """Wait until a viewer has subscribed to its topics; return whether there is one."""
         if not self._watched.wait(timeout_s):
             return False
         while self._another.wait(SETTLED_S):

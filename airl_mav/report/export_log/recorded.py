@@ -62,13 +62,6 @@ class RecordedFlight:
         sent = columns.get("sent_us", np.zeros(0, np.int64)) != NO_STAMP
         return {name: column[sent] for name, column in columns.items()}
 
-    def navigates(self, time_us: int) -> bool:
-        """Return whether the policy flies."""
-        record = self.replayed.record
-        return record.navigation_us is not None and (
-            record.navigation_us <= time_us < record.ended_us
-        )
-
 
 @dataclass(frozen=True)
 class Charge:

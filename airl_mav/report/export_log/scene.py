@@ -15,31 +15,13 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena, Bounds, Shape
 from airl_mav.arena.triangles import drawn, standing
-from airl_mav.black_box.channels import Channel
+from airl_mav.black_box.messages import Channel
 from airl_mav.core import frames
 from airl_mav.core.clock import NS_PER_US
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.goals import Goal, goal_height_m
 from airl_mav.profiles.vehicle import CORNERS
-from airl_mav.view.look import (
-    ARROW_S,
-    COMMANDED,
-    FIRST,
-    FLOOR,
-    FLOWN,
-    GLASS_OPACITY,
-    GOAL,
-    HILLS,
-    LEAST_ARROW_M,
-    MOVING,
-    NOSE,
-    OPEN,
-    START,
-    STILL,
-    WALL_OPACITY,
-    Colour,
-    Look,
-)
+from airl_mav.view import style
 from airl_mav.view.messages import VehicleShape
 
 Floats = NDArray[np.float64]
@@ -104,11 +86,13 @@ def points(ned: Floats) -> list[messages.Point3]:
     return [messages.Point3(x=x, y=y, z=z) for x, y, z in frames.ned_to_enu(ned).tolist()]
 
 
-def colour(rgb: Colour, opacity: float = 1.0) -> messages.Color:
+def colour(rgb: style.Colour, opacity: float = 1.0) -> messages.Color:
     """Return a colour."""
     red, green, blue = (part / 255.0 for part in rgb)
     return messages.Color(r=red, g=green, b=blue, a=opacity)
 
+
+_ORIGIN = messages.Pose(position=vector(np.zeros(3)), orientation=quaternion(UNTURNED))
 
 THIN_M = 0.02
 """Floor, walls and discs."""
@@ -116,35 +100,35 @@ THIN_M = 0.02
 Size = tuple[float, float, float]
 
 
+def _entity(name: str, at: messages.Timestamp, **primitives: Any) -> messages.SceneEntity:
+    return messages.SceneEntity(timestamp=at, frame_id=WORLD, id=name, **primitives)
+
+
 def arena_scene(
     arena: Arena | None, goal: Goal, goal_radius_m: float, at: messages.Timestamp
 ) -> messages.SceneUpdate:
     """Return what stands still: floor, hills, walls, obstacles, goal and start."""
-    bounds = OPEN if arena is None else arena.bounds
+    bounds = style.OPEN if arena is None else arena.bounds
     ground = None if arena is None else arena.ground
     base_m = 0.0 if ground is None else ground.height_at(goal[0], goal[1])
     top_m = goal_height_m(goal) or base_m + 0.6 * bounds.height
     entities = [
-        messages.SceneEntity(timestamp=at, frame_id=WORLD, id="floor", cubes=[_floor(bounds)]),
+        _entity("floor", at, cubes=[_floor(bounds)]),
         _ends(goal, goal_radius_m, (base_m, top_m), at),
     ]
     if ground is not None:
-        entities.append(_surface("ground", ground.points, ground.faces, HILLS, at))
+        entities.append(_surface("ground", ground.points, ground.faces, style.HILLS, at))
     if arena is not None:
-        walls = messages.SceneEntity(
-            timestamp=at, frame_id=WORLD, id="walls", cubes=_walls(bounds, arena.wall_colour)
-        )
+        entities.append(_entity("walls", at, cubes=_walls(bounds, arena.wall_colour)))
         centers = arena.obstacles.center
         shown = drawn(arena.meshes)
-        still = [
-            obstacle(arena, i, centers[i], STILL, f"obstacle/{i}", at)
+        entities += [
+            obstacle(arena, i, centers[i], style.STILL, f"obstacle/{i}", at)
             for i in range(arena.n_static)
             if arena.mesh_of(i) not in shown
         ]
         entities += [
-            walls,
-            *still,
-            *(_surface(f"mesh/{each.first}", *standing(each), STILL, at) for each in shown),
+            _surface(f"mesh/{each.first}", *standing(each), style.STILL, at) for each in shown
         ]
     return messages.SceneUpdate(entities=entities)
 
@@ -154,7 +138,7 @@ def movers_scene(arena: Arena, from_us: int, at: messages.Timestamp) -> messages
     centers = arena.centers_at(from_us)
     moving = range(arena.n_static, len(arena.obstacles))
     return messages.SceneUpdate(
-        entities=[obstacle(arena, i, centers[i], MOVING, f"mover/{i}", at) for i in moving]
+        entities=[obstacle(arena, i, centers[i], style.MOVING, f"mover/{i}", at) for i in moving]
     )
 
 
@@ -162,40 +146,37 @@ def path_scene(way: Floats, at: messages.Timestamp) -> messages.SceneUpdate:
     """Return the whole way (n, 3) NED [m] as a line."""
     line = messages.LinePrimitive(
         type=messages.LinePrimitiveLineType.LineStrip,
-        pose=messages.Pose(position=vector(np.zeros(3)), orientation=quaternion(UNTURNED)),
+        pose=_ORIGIN,
         thickness=2.0,  # pixels
         scale_invariant=True,
         points=points(way),
-        color=colour(FIRST.trail),
+        color=colour(style.FIRST.trail),
     )
-    return messages.SceneUpdate(
-        entities=[messages.SceneEntity(timestamp=at, frame_id=WORLD, id="path", lines=[line])]
-    )
+    return messages.SceneUpdate(entities=[_entity("path", at, lines=[line])])
 
 
 def velocity_scene(
     position: Floats, flown: Floats, commanded: Floats | None, at: messages.Timestamp
 ) -> messages.SceneUpdate:
     """Return the velocities (3,) NED [m/s] as arrows from the vehicle's position (3,) NED [m]."""
-    arrows = [_arrow(position, flown, FLOWN)]
+    arrows = [_arrow(position, flown, style.FLOWN)]
     if commanded is not None:
-        arrows.append(_arrow(position, commanded, COMMANDED))
+        arrows.append(_arrow(position, commanded, style.COMMANDED))
     shown = [arrow for arrow in arrows if arrow is not None]
-    return messages.SceneUpdate(
-        entities=[messages.SceneEntity(timestamp=at, frame_id=WORLD, id="velocity", arrows=shown)]
-    )
+    return messages.SceneUpdate(entities=[_entity("velocity", at, arrows=shown)])
 
 
 def vehicle_scene(
-    shape: VehicleShape, frame: str, look: Look, at: messages.Timestamp
+    shape: VehicleShape, frame: str, look: style.Look, at: messages.Timestamp
 ) -> messages.SceneUpdate:
     """Return a vehicle of its parts, which moves with its frame."""
     forward, right = shape.arm_forward_m, shape.arm_right_m
     height, size = max(0.04, 0.5 * shape.height_m), 0.45 * min(forward, right)
     opacity = 1.0 if look.whole else 0.4
+    nose = _in_body(np.array([2.0 * size, 0.0, 0.0]))
     cubes = [
-        _part((0.0, 0.0, 0.0), (3.4 * size, 2.2 * size, height), look.body, opacity),
-        _part((2.0 * size, 0.0, 0.0), (0.9 * size, size, 0.6 * height), NOSE, opacity),
+        _cube(_in_body(np.zeros(3)), (3.4 * size, 2.2 * size, height), look.body, opacity),
+        _cube(nose, (0.9 * size, size, 0.6 * height), style.NOSE, opacity),
     ]
     rotors = []
     for corner in CORNERS:
@@ -203,17 +184,10 @@ def vehicle_scene(
         at_frd = np.array(
             [forward if fore else -forward, right if side else -right, -0.5 * height - THIN_M]
         )
-        cubes.append(_arm(at_frd, look.body, opacity))
+        arm = _in_body(np.array([*(0.5 * at_frd[:2]), 0.0]), math.atan2(at_frd[1], at_frd[0]))
+        cubes.append(_cube(arm, (math.hypot(*at_frd[:2]), 0.025, 0.02), look.body, opacity))
         rotors.append(
-            messages.CylinderPrimitive(
-                pose=_in_body(at_frd),
-                size=messages.Vector3(
-                    x=2.0 * shape.rotor_radius_m, y=2.0 * shape.rotor_radius_m, z=THIN_M
-                ),
-                bottom_scale=1.0,
-                top_scale=1.0,
-                color=colour(look.disc, 0.5 * opacity),
-            )
+            _cylinder(_in_body(at_frd), shape.rotor_radius_m, THIN_M, look.disc, 0.5 * opacity)
         )
     entity = messages.SceneEntity(
         timestamp=at, frame_id=frame, id=frame, frame_locked=True, cubes=cubes, cylinders=rotors
@@ -222,7 +196,7 @@ def vehicle_scene(
 
 
 def obstacle(
-    arena: Arena, i: int, center: Floats, rgb: Colour, name: str, at: messages.Timestamp
+    arena: Arena, i: int, center: Floats, rgb: style.Colour, name: str, at: messages.Timestamp
 ) -> messages.SceneEntity:
     """Return obstacle i, whose centre (3,) NED [m] is there now."""
     half_size = arena.obstacles.half_size[i]
@@ -231,36 +205,35 @@ def obstacle(
     look: dict[str, Any] = {
         "pose": pose(center, yaw),
         "size": vector(2.0 * half_size),
-        "color": colour(rgb, GLASS_OPACITY if glass else 1.0),
+        "color": colour(rgb, style.GLASS_OPACITY if glass else 1.0),
     }
-    entity: dict[str, Any] = {"timestamp": at, "frame_id": WORLD, "id": name}
     if arena.obstacles.shape[i] == Shape.BOX:
-        return messages.SceneEntity(**entity, cubes=[messages.CubePrimitive(**look)])
+        return _entity(name, at, cubes=[messages.CubePrimitive(**look)])
     if arena.obstacles.shape[i] == Shape.SPHERE:
-        return messages.SceneEntity(**entity, spheres=[messages.SpherePrimitive(**look)])
+        return _entity(name, at, spheres=[messages.SpherePrimitive(**look)])
     whole = messages.CylinderPrimitive(**look, bottom_scale=1.0, top_scale=1.0)
-    return messages.SceneEntity(**entity, cylinders=[whole])
+    return _entity(name, at, cylinders=[whole])
 
 
 def _surface(
-    name: str, places: Floats, faces: NDArray[np.int32], rgb: Colour, at: messages.Timestamp
+    name: str, places: Floats, faces: NDArray[np.int32], rgb: style.Colour, at: messages.Timestamp
 ) -> messages.SceneEntity:
     surface = messages.TriangleListPrimitive(
-        pose=messages.Pose(position=vector(np.zeros(3)), orientation=quaternion(UNTURNED)),
+        pose=_ORIGIN,
         points=points(places),
         color=colour(rgb),
         indices=faces.ravel().tolist(),
     )
-    return messages.SceneEntity(timestamp=at, frame_id=WORLD, id=name, triangles=[surface])
+    return _entity(name, at, triangles=[surface])
 
 
 def _floor(b: Bounds) -> messages.CubePrimitive:
     north, east = 0.5 * (b.north_min + b.north_max), 0.5 * (b.east_min + b.east_max)
     size = (b.north_max - b.north_min, b.east_max - b.east_min, THIN_M)
-    return _block(np.array([north, east, 0.5 * THIN_M]), size, FLOOR)
+    return _cube(pose(np.array([north, east, 0.5 * THIN_M])), size, style.FLOOR)
 
 
-def _walls(b: Bounds, rgb: Colour) -> list[messages.CubePrimitive]:
+def _walls(b: Bounds, rgb: style.Colour) -> list[messages.CubePrimitive]:
     north, east = 0.5 * (b.north_min + b.north_max), 0.5 * (b.east_min + b.east_max)
     along_east = (THIN_M, b.east_max - b.east_min, b.height)
     along_north = (b.north_max - b.north_min, THIN_M, b.height)
@@ -271,7 +244,8 @@ def _walls(b: Bounds, rgb: Colour) -> list[messages.CubePrimitive]:
         (north, b.east_max, along_north),
     ]
     return [
-        _block(np.array([x, y, -0.5 * b.height]), size, rgb, WALL_OPACITY) for x, y, size in sides
+        _cube(pose(np.array([x, y, -0.5 * b.height])), size, rgb, style.WALL_OPACITY)
+        for x, y, size in sides
     ]
 
 
@@ -280,38 +254,31 @@ def _ends(
 ) -> messages.SceneEntity:
     """Return the goal with its name and its pole, from a height to another, and the start."""
 
-    def disc(
-        place: tuple[float, float, float], radius: float, rgb: Colour
-    ) -> messages.CylinderPrimitive:
-        return _cylinder(np.array(place) - [0.0, 0.0, THIN_M], radius, THIN_M, rgb, 0.45)
+    def disc(place: Size, radius: float, rgb: style.Colour) -> messages.CylinderPrimitive:
+        return _cylinder(pose(np.array(place) - [0.0, 0.0, THIN_M]), radius, THIN_M, rgb, 0.45)
 
     (north, east), (base, top) = goal[:2], pole_m
-    pole = _cylinder(np.array([north, east, -0.5 * (base + top)]), 0.04, top - base, GOAL)
+    middle = pose(np.array([north, east, -0.5 * (base + top)]))
+    pole = _cylinder(middle, 0.04, top - base, style.GOAL)
     name = messages.TextPrimitive(
         pose=pose(np.array([north, east, -top - 0.4])),
         billboard=True,
         font_size=0.6,
-        color=colour(GOAL),
+        color=colour(style.GOAL),
         text="goal",
     )
-    return messages.SceneEntity(
-        timestamp=at,
-        frame_id=WORLD,
-        id="goal",
-        cylinders=[
-            disc((north, east, -base), radius_m, GOAL),
-            pole,
-            disc((0.0, 0.0, 0.0), 0.4, START),
-        ],
-        texts=[name],
+    discs = (
+        disc((north, east, -base), radius_m, style.GOAL),
+        disc((0.0, 0.0, 0.0), 0.4, style.START),
     )
+    return _entity("goal", at, cylinders=[discs[0], pole, discs[1]], texts=[name])
 
 
 def _cylinder(
-    center: Floats, radius: float, height: float, rgb: Colour, opacity: float = 1.0
+    at: messages.Pose, radius: float, height: float, rgb: style.Colour, opacity: float = 1.0
 ) -> messages.CylinderPrimitive:
     return messages.CylinderPrimitive(
-        pose=pose(center),
+        pose=at,
         size=messages.Vector3(x=2.0 * radius, y=2.0 * radius, z=height),
         bottom_scale=1.0,
         top_scale=1.0,
@@ -319,11 +286,10 @@ def _cylinder(
     )
 
 
-def _block(center: Floats, size: Size, rgb: Colour, opacity: float = 1.0) -> messages.CubePrimitive:
-    x, y, z = size
-    return messages.CubePrimitive(
-        pose=pose(center), size=messages.Vector3(x=x, y=y, z=z), color=colour(rgb, opacity)
-    )
+def _cube(
+    at: messages.Pose, size: Size, rgb: style.Colour, opacity: float = 1.0
+) -> messages.CubePrimitive:
+    return messages.CubePrimitive(pose=at, size=vector(np.array(size)), color=colour(rgb, opacity))
 
 
 def _in_body(frd: Floats, yaw: float = 0.0) -> messages.Pose:
@@ -332,29 +298,10 @@ def _in_body(frd: Floats, yaw: float = 0.0) -> messages.Pose:
     return messages.Pose(position=vector(frames.frd_to_flu(frd)), orientation=quaternion(turned))
 
 
-def _part(frd: Size, size: Size, rgb: Colour, opacity: float) -> messages.CubePrimitive:
-    x, y, z = size
-    return messages.CubePrimitive(
-        pose=_in_body(np.array(frd)),
-        size=messages.Vector3(x=x, y=y, z=z),
-        color=colour(rgb, opacity),
-    )
-
-
-def _arm(rotor: Floats, rgb: Colour, opacity: float) -> messages.CubePrimitive:
-    forward, right, _ = rotor.tolist()
-    half = np.array([0.5 * forward, 0.5 * right, 0.0])
-    return messages.CubePrimitive(
-        pose=_in_body(half, math.atan2(right, forward)),
-        size=messages.Vector3(x=math.hypot(forward, right), y=0.025, z=0.02),
-        color=colour(rgb, opacity),
-    )
-
-
-def _arrow(position: Floats, velocity: Floats, rgb: Colour) -> messages.ArrowPrimitive | None:
+def _arrow(position: Floats, velocity: Floats, rgb: style.Colour) -> messages.ArrowPrimitive | None:
     """Return the arrow of a velocity NED [m/s]; None: it is too short."""
-    length = ARROW_S * float(np.linalg.norm(velocity))
-    if length < LEAST_ARROW_M:
+    length = style.ARROW_S * float(np.linalg.norm(velocity))
+    if length < style.LEAST_ARROW_M:
         return None
     head = min(0.16, 0.5 * length)
     return messages.ArrowPrimitive(

@@ -12,10 +12,10 @@ import numpy as np
 from foxglove import messages
 from numpy.typing import NDArray
 
-from airl_mav.black_box.channels import Channel, encoded
 from airl_mav.black_box.messages import (
     INFO,
     WARNING,
+    Channel,
     Command,
     End,
     Latency,
@@ -24,6 +24,7 @@ from airl_mav.black_box.messages import (
     Status,
     Telemetry,
     Truth,
+    encoded,
     text,
 )
 from airl_mav.core.clock import since_1970_us
@@ -55,9 +56,9 @@ from airl_mav.report.export_log.scene import (
 from airl_mav.report.forensics.camera_view import PolicyCamera
 from airl_mav.report.recorded_flight import NAVIGATING
 from airl_mav.report.replay.flight import STANDING_M
-from airl_mav.view.look import FIRST, OTHER
 from airl_mav.view.messages import VehicleShape
 from airl_mav.view.shown import OFFBOARD
+from airl_mav.view.style import FIRST, OTHER
 
 ENDED = "ended"
 """The phase after navigation."""
@@ -178,7 +179,7 @@ class FlightMessages:
         for i in range(0, len(path), SAMPLES_A_SCENE):
             time_us = int(path.time_us[i])
             at = timestamp(self._unix_us(time_us))
-            command = commanded[i] if self.flight.navigates(time_us) else None
+            command = commanded[i] if self._record.navigates(time_us) else None
             arrows = velocity_scene(path.position[i], path.velocity[i], command, at)
             yield self._drawn(time_us, "/scene/velocity", arrows)
             if arena is not None and arena.tours:
@@ -238,7 +239,7 @@ class FlightMessages:
         charge = charge_of(self.flight)
         for i in range(0, len(self._path), SAMPLES_A_STATUS):
             time_us = int(self._path.time_us[i])
-            navigates = self.flight.navigates(time_us)
+            navigates = self._record.navigates(time_us)
             flies = navigates or -float(self._path.position[i, 2]) > STANDING_M
             battery = (
                 (None, None, None)
@@ -259,7 +260,7 @@ class FlightMessages:
         which = np.searchsorted(columns["sent_us"], self._path.time_us, side="right") - 1
         rates = np.where(which < 0, 0.0, columns[SETPOINT][np.maximum(which, 0), 3])
         for i, time_us in enumerate(self._path.time_us.tolist()):
-            if self.flight.navigates(time_us):
+            if self._record.navigates(time_us):
                 command = Command(time_us, tuple(velocities[i].tolist()), float(rates[i]))
                 yield self._ours(time_us, command)
 

@@ -1,7 +1,4 @@
-"""Flights without a flight controller's own log as ULog, with the topics of `flight_log.topics`.
-
-Unknown fields are NaN, or 0 if they are integers.
-"""
+"""Flights as ULog, with the topics of `flight_log.topics`; unknown fields are NaN or 0."""
 
 from __future__ import annotations
 
@@ -61,11 +58,7 @@ Sample = tuple[int, str, Values]
 
 
 def write_ulog(flight: RecordedFlight, path: Path) -> None:
-    """Write a flight as ULog, replacing an existing file.
-
-    ULog times are not negative: if the vehicle's log begins before the companion, all times are
-    shifted.
-    """
+    """Write a flight as ULog, whose times are shifted if the vehicle's log begins before 0."""
     began_us = int(flight.replayed.path.time_us[0])
     later_us = max(0, -began_us)
     writer = UlogWriter(
@@ -196,7 +189,7 @@ def _commanded(flight: RecordedFlight, interval_us: int) -> Iterator[tuple[int, 
     which = np.searchsorted(flight.decisions["sent_us"], path.time_us, side="right") - 1
     for i in _every(path, interval_us):
         time_us = int(path.time_us[i])
-        if which[i] >= 0 and flight.navigates(time_us):
+        if which[i] >= 0 and flight.replayed.record.navigates(time_us):
             yield time_us, int(which[i])
 
 
@@ -222,7 +215,7 @@ def _states(flight: RecordedFlight, path: Trajectory) -> Iterator[Sample]:
     """Give who flies and whether it flies, when that changes and every half second."""
     last, due_us = None, 0
     for time_us, position in zip(path.time_us.tolist(), path.position, strict=True):
-        navigates = flight.navigates(time_us)
+        navigates = flight.replayed.record.navigates(time_us)
         flies = navigates or -float(position[2]) > STANDING_M
         if (navigates, flies) == last and time_us < due_us:
             continue

@@ -121,11 +121,7 @@ def view_obstacle(
     i: int,
     camera: PolicyCamera,
 ) -> ObstacleView:
-    """Return the direction and visibility of obstacle i on the frame exposed at `frame_us`.
-
-    `hit_us` is the collision, `began_us` the start of the episode and of the obstacles' motion
-    [µs].
-    """
+    """Return the direction and visibility of obstacle i on a frame; it moves since `began_us`."""
     position, _, quaternion = pose_at(path, frame_us)
     centers, centers_then = (
         arena.centers_at(frame_us - began_us),

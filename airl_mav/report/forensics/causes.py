@@ -145,7 +145,7 @@ SLOW_EXCESS = 0.25
 """A flight is slow, or long, when it takes this much more than the run's usual one."""
 
 ACT_S = 0.2
-"""A multicopter has to tilt before it brakes or swerves: with less time than this after the motors
+"""A multicopter has to tilt before it brakes or swerves. With less time than this after the motors
 answered, nothing of the decision shows in its path."""
 
 USUAL = "as usual"

@@ -133,7 +133,7 @@ DETOUR_EXCESS = 0.25
 def cause_of_long_flight(flight: Evidence, usual: UsualFlight) -> Cause:
     """Return why a flight took long, or never arrived."""
     record, path = flight.record, flight.path
-    start_us = record.started_us if record.navigation_us is None else record.navigation_us
+    start_us = record.zero_us
     part = path.between(start_us, record.ended_us)
     if len(part) < 2:
         return Cause(NO_CAUSE, ())

@@ -20,7 +20,7 @@ from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report.forensics import evidence
 from airl_mav.report.forensics.camera_view import PolicyCamera
 from airl_mav.report.forensics.causes import cause_of
-from airl_mav.report.table import NONE, OUTCOME_LABELS, Column, TableView
+from airl_mav.report.table import NONE, OUTCOME_LABELS, TableView, columns_of
 
 EXAMINED = 100
 """Flights whose cause is looked for: the worst."""
@@ -81,14 +81,8 @@ def examine_worst(
 
 def worst_table(judged: Sequence[ExaminedFlight], total: int) -> TableView:
     """Return the worst flights with their causes."""
-    columns = (
-        Column("#"),
-        Column("seed"),
-        Column("outcome", number=False),
-        Column("after", "s"),
-        Column("time lost", "s"),
-        Column("way", "x straight"),
-        Column("cause", number=False),
+    columns = columns_of(
+        "# | seed | <outcome | after [s] | time lost [s] | way [x straight] | <cause"
     )
     shown = judged[:LISTED]
     notes = [
@@ -102,7 +96,6 @@ def worst_table(judged: Sequence[ExaminedFlight], total: int) -> TableView:
 
 def _row(judged: ExaminedFlight) -> tuple[str, ...]:
     record = judged.record
-    began_us = record.started_us if record.navigation_us is None else record.navigation_us
     arrived = record.outcome is Outcome.SUCCESS
     # What ended early has not saved time.
     whole = arrived or record.outcome is Outcome.TIMEOUT
@@ -110,7 +103,7 @@ def _row(judged: ExaminedFlight) -> tuple[str, ...]:
         f"{record.index}",
         f"{record.seed}",
         OUTCOME_LABELS[record.outcome],
-        f"{(record.ended_us - began_us) / US_PER_S:.1f}",
+        f"{(record.ended_us - record.zero_us) / US_PER_S:.1f}",
         NONE if judged.lost_s is None or not whole else f"{round(judged.lost_s, 1) + 0.0:+.1f}",
         NONE if judged.excess is None or not arrived else f"{1.0 + judged.excess:.2f}",
         judged.cause.kind,
@@ -135,12 +128,7 @@ def causes_table(judged: Sequence[ExaminedFlight], run: LoadedRun) -> TableView 
                 ", ".join(which[:NAMED]) + more,
             )
         )
-    columns = (
-        Column("cause", number=False),
-        Column("flights"),
-        Column("of those that failed", "%"),
-        Column("which", number=False),
-    )
+    columns = columns_of("<cause | flights | of those that failed [%] | <which")
     all_failed = sum(e.outcome is not Outcome.SUCCESS for e in run.episodes)
     notes: tuple[str, ...] = ()
     if all_failed > len(failed):

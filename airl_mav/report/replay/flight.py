@@ -127,9 +127,7 @@ class ReplayedFlight:
         """Make `shown` what it was so long after the reset [s]; episode and arena are there."""
         record, time_us = self.record, self.time_us(seconds)
         position, velocity, quaternion = pose_at(self.path, time_us)
-        navigates = record.navigation_us is not None and (
-            record.navigation_us <= time_us < record.ended_us
-        )
+        navigates = record.navigates(time_us)
         flies = navigates or -position[2] > STANDING_M
         x, y, z = position.tolist()
         vx, vy, vz = velocity.tolist()

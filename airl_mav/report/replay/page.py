@@ -13,10 +13,10 @@ from airl_mav.core.errors import UsageError
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.report.replay.flight import ReplayedFlight, parting_s
 from airl_mav.report.replay.runs import ReplayedRun, ReplayedRuns
-from airl_mav.view.look import OTHER
 from airl_mav.view.panel import Panel
 from airl_mav.view.scene import FlightScene
 from airl_mav.view.shown import Shown
+from airl_mav.view.style import OTHER
 from airl_mav.view.watchers import Watchers
 
 DRAW_US = 33_000
@@ -29,7 +29,7 @@ PANEL_S = 0.2
 """Time between two drawings of the panel and the camera's image [wall s]."""
 
 GLIDE_S = 0.1
-"""In so much time the scene follows the slider [wall s]: a page without a GPU tells of it
+"""In so much time the scene follows the slider [wall s]. A page without a GPU tells of it
 every 0.09 s."""
 
 STEP_S = 0.02
@@ -55,15 +55,7 @@ class ReplayPage:
         first: EpisodeRecord | None = None,
         runs: ReplayedRuns | None = None,
     ) -> None:
-        """Build the page at the start of a flight.
-
-        Args:
-            server: The server.
-            run: The run to replay.
-            beside: A run to show beside it, by seed; None = none.
-            first: The first flight; None = the worst.
-            runs: Selectable runs; None = no others.
-        """
+        """Build the page at the start of a flight: of `first`, or the worst."""
         self._run, self._beside, self._runs = run, beside, runs
         self._shown, self._others = Shown(), Shown()
         self._scene = FlightScene(server)

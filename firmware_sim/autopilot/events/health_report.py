@@ -7,6 +7,7 @@ A report is an arming summary, one event for each failing check, and a health su
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from functools import lru_cache
 from typing import NamedTuple
 
 from airl_mav.core.constants import US_PER_S
@@ -59,6 +60,7 @@ class HealthReport(NamedTuple):
         )
 
 
+@lru_cache(maxsize=256)
 def health_report(readiness: Readiness) -> HealthReport:
     """Return what the checks find, for all modes at once."""
     in_modes = {mode: readiness._replace(mode=mode) for mode in Mode}

@@ -149,7 +149,7 @@ class Supervisor:
 
     def readiness(self, sample: SensorSample, flight: Flight, mode: Mode) -> Readiness:
         """Return what the pre-arm checks look at, for arming in a mode."""
-        now_us, sensors, attitude = sample.time_us, self.sensors, self.watch.attitude
+        now_us, attitude = sample.time_us, self.watch.attitude
         return Readiness(
             mode,
             self.conditions,
@@ -157,11 +157,7 @@ class Supervisor:
             converged=self._estimator.healthy,
             compass_agrees=not self._estimator.recovery.compass.given_up,
             field_disturbed=flight.phase < _GROUND and self._estimator.field_disturbed,
-            gyro=sensors.gyro.has_data(now_us),
-            accel=sensors.accel.has_data(now_us),
-            mag=sensors.mag.has_data(now_us),
-            baro=sensors.baro.has_data(now_us),
-            gps=sensors.gps.has_data(now_us),
+            **self.sensors.valid(now_us)._asdict(),
             distance=self._ranges(now_us),
             rolled=attitude.roll,
             pitched=attitude.pitch,
@@ -172,14 +168,13 @@ class Supervisor:
 
     def health(self, now_us: int) -> Health:
         """Return what can be believed and used, for clients."""
-        seen, sensors = self.conditions, self.sensors
-        mag, baro, gps = (s.has_data(now_us) for s in (sensors.mag, sensors.baro, sensors.gps))
+        seen, sensors = self.conditions, self.sensors.valid(now_us)
         return Health(
             gyro=not seen.angular_velocity_invalid,
-            accel=sensors.accel.has_data(now_us),
-            mag=mag and not self._estimator.recovery.compass.given_up,
-            baro=baro,
-            gps=gps,
+            accel=sensors.accel,
+            mag=sensors.mag and not self._estimator.recovery.compass.given_up,
+            baro=sensors.baro,
+            gps=sensors.gps,
             distance=self._ranges(now_us) if self._arming.sys_has_num_dist > 0 else None,
             attitude=not seen.attitude_invalid,
             velocity=not seen.local_velocity_invalid,

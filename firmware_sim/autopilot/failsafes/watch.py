@@ -168,7 +168,7 @@ class Watch:
                 (self._velocity, speed_accuracy, p.com_vel_fs_evh),
             ):
                 validity.update(now_us, good=position, accuracy=sigma, needed=limit)
-        local = self._local.valid
+        local, sensors = self._local.valid, self.sensors.valid(now_us)
         self._battery = self._charge(sample.battery, armed=armed)
         long_flight = (
             p.com_flt_time_max > 0.0
@@ -176,12 +176,8 @@ class Watch:
             and now_us - self._takeoff_us > p.com_flt_time_max * US_PER_S
         )
         return Conditions(
-            angular_velocity_invalid=not self.sensors.gyro.has_data(now_us),
-            attitude_invalid=not (
-                estimator.aligned
-                and self.sensors.gyro.has_data(now_us)
-                and self.sensors.accel.has_data(now_us)
-            ),
+            angular_velocity_invalid=not sensors.gyro,
+            attitude_invalid=not (estimator.aligned and sensors.gyro and sensors.accel),
             local_altitude_invalid=not estimator.knows_height(now_us),
             local_position_invalid=not local,
             local_position_invalid_relaxed=not self._relaxed.valid,

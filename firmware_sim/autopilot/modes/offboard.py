@@ -112,17 +112,17 @@ def demand_of(setpoint: Setpoint) -> Demand | TrajectoryDemand:
         return HOVER._replace(yaw=setpoint.yaw, yaw_rate=setpoint.yaw_rate)
     if all(map(math.isnan, acceleration)):
         # A velocity that is not commanded adds nothing to a position.
-        north, east, down = velocity
-        known = _or_zero(north), _or_zero(east), _or_zero(down)
-        return Demand(position, known, setpoint.yaw, setpoint.yaw_rate)
+        north, east, down = (0.0 if math.isnan(speed) else speed for speed in velocity)
+        return Demand(position, (north, east, down), setpoint.yaw, setpoint.yaw_rate)
     return TrajectoryDemand(position, velocity, acceleration, setpoint.yaw, setpoint.yaw_rate)
 
 
 def _is_valid(position: Vec, velocity: Vec, acceleration: Vec) -> bool:
-    kinds = (position, velocity, acceleration)
-    paired = all(math.isnan(kind[0]) == math.isnan(kind[1]) for kind in kinds)
-    return paired and all(any(not math.isnan(kind[axis]) for kind in kinds) for axis in range(3))
-
-
-def _or_zero(value: float) -> float:
-    return 0.0 if math.isnan(value) else value
+    isnan = math.isnan
+    for kind in (position, velocity, acceleration):
+        if isnan(kind[0]) != isnan(kind[1]):
+            return False
+    for p, v, a in zip(position, velocity, acceleration, strict=True):
+        if isnan(p) and isnan(v) and isnan(a):
+            return False
+    return True

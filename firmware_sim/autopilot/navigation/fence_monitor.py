@@ -56,7 +56,7 @@ class FenceMonitor:
         action = round(self._value("GF_ACTION"))
         if self._holding and mode is not Mode.HOLD and any(self.status.breached):
             self._holding = False
-        if action == 0 or not self._is_set:
+        if action == 0 or not self.is_set:
             if any(self.status.breached):
                 self.status = self.status._replace(distance=False, altitude=False, custom=False)
             return
@@ -79,7 +79,8 @@ class FenceMonitor:
         self.status = after
 
     @property
-    def _is_set(self) -> bool:
+    def is_set(self) -> bool:
+        """Whether there are areas, or limits about home."""
         value = self._value
         limited = value("GF_MAX_HOR_DIST") > 0.0 or value("GF_MAX_VER_DIST") > 0.0
         return limited or bool(self._areas)

@@ -1,4 +1,4 @@
-"""Runs what leads the vehicle besides the modes themselves: PX4's navigator, at its 20 Hz."""
+"""PX4's navigator: missions, geofence and the way home, at 20 Hz while it leads the vehicle."""
 
 from __future__ import annotations
 
@@ -32,6 +32,11 @@ from firmware_sim.autopilot.navigation.way_home import (
 )
 from firmware_sim.autopilot.requests import Place, Reposition, Request
 
+IDLE_US = 100_000
+"""Period in modes that it does not lead: what it reports then is read at 10 Hz."""
+
+_LED = (Mode.MISSION, Mode.RETURN)
+
 _WARN = 1
 """GF_ACTION: up to here the fence is told of, and not kept."""
 
@@ -55,6 +60,8 @@ class Navigator:
         """What of the geofence is breached."""
         self.due_us = 0
         """When to step next [µs]; 0 = at once."""
+        self.idle = False
+        """Whether steps change nothing as long as mode, plans, home and parameters stay."""
         self._crew = crew
         self._returned = False
         """Whether the way of the present return has been chosen."""
@@ -171,9 +178,11 @@ class Navigator:
         self, situation: Situation, mode: Mode, place: Callable[[], Geodetic], *, armed: bool
     ) -> None:
         """Advance by a period; `place` is where the vehicle is, for the geofence."""
-        self.due_us = situation.time_us + PERIOD_US
+        self.due_us = situation.time_us + (PERIOD_US if mode in _LED else IDLE_US)
         self._position = situation.position
         self.fence.step(situation, mode, place)
+        led = mode in _LED or self._value("BAT1_CAPACITY") > 0.0
+        self.idle = not (led or self.fence.is_set or any(self.fence.status.breached))
         flying = armed and mode is Mode.MISSION
         self._step_home(situation, returning=armed and mode is Mode.RETURN)
         if flying and not self._flying:

@@ -163,6 +163,8 @@ class Plans:
         """Index of the mission item that is flown, or will be when the mission goes on."""
         self.set_current_count = 0
         """Rises whenever a client chooses the current item."""
+        self.changes = 0
+        """Rises with every list that is stored, and every choice of the current item."""
         self.reached = -1
         """Index of the newest item that was reached; -1 = none in this run."""
         self.jumps_done: dict[int, int] = {}
@@ -189,6 +191,7 @@ class Plans:
         `current` is the mission item to begin with; -1 = the present index, if there is such an
         item.
         """
+        self.changes += 1
         self._stored[kind] = Stored(items, identity, self._stored[kind].revision + 1)
         if kind is Kind.MISSION:
             self.current = current if current >= 0 else min(self.current, max(0, len(items) - 1))
@@ -206,3 +209,4 @@ class Plans:
             raise IndexError(f"mission item {index}: there are {len(self.mission)}")
         self.current = index
         self.set_current_count += 1
+        self.changes += 1

@@ -5,8 +5,7 @@ from __future__ import annotations
 from itertools import count
 
 from airl_mav.core.clock import NS_PER_US
-from firmware_sim.autopilot.autopilot_state import AutopilotState
-from firmware_sim.mavlink.codec import Values, WireMessage, dialect
+from firmware_sim.mavlink.codec import WireMessage, dialect
 from firmware_sim.mavlink.services.context import ANY, Context, sender
 from firmware_sim.mavlink.streams import Builder
 
@@ -43,9 +42,3 @@ def ping_requests() -> Builder:
     """Return the builder of one link's PING stream, which counts its requests."""
     sequence = count()
     return lambda state: (state.time_us, next(sequence) & 0xFFFF_FFFF, ANY, ANY)
-
-
-def timesync_request(state: AutopilotState) -> Values:
-    """Return our own TIMESYNC request, a stream on the onboard link."""
-    tc1 = 0
-    return tc1, state.time_us * NS_PER_US

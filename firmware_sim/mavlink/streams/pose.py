@@ -6,36 +6,13 @@ import math
 
 import numpy as np
 
-from airl_mav.core.constants import GRAVITY_M_S2
-from airl_mav.core.frames import Geodetic, geodetic_to_local, local_to_geodetic, quat_yaw
-from airl_mav.vehicle.rotation import Vec, rotate
+from airl_mav.core.frames import Geodetic, geodetic_to_local, local_to_geodetic
 from firmware_sim.autopilot.autopilot_state import AutopilotState
 from firmware_sim.mavlink.codec import Values, dialect
 from firmware_sim.mavlink.streams import units
 
 _NO_APPROACH = (0.0, 0.0, 0.0)
 """HOME_POSITION: there is no special way to land."""
-
-
-def position_target_global_int(state: AutopilotState) -> Values | None:
-    """Where an automatic mode is going, and how fast the vehicle shall be now; else nothing."""
-    target, origin = state.destination, state.origin
-    if target is None or origin is None or not all(map(math.isfinite, target)):
-        return None
-    place = local_to_geodetic(np.array(target), origin)
-    yaw, nothing_ignored = state.setpoint.yaw, 0
-    return (
-        units.boot_ms(state.time_us),
-        dialect.MAV_FRAME_GLOBAL_INT,
-        nothing_ignored,
-        units.deg_e7(place.latitude_deg),
-        units.deg_e7(place.longitude_deg),
-        place.altitude_m,
-        *state.setpoint.velocity.tolist(),
-        *_acceleration(state),
-        yaw if math.isfinite(yaw) else quat_yaw(state.attitude_setpoint),
-        0.0,
-    )
 
 
 def orbit_execution_status(state: AutopilotState) -> Values | None:
@@ -79,13 +56,6 @@ def _wire(place: Geodetic) -> Values:
         units.deg_e7(place.longitude_deg),
         units.mm(place.altitude_m),
     )
-
-
-def _acceleration(state: AutopilotState) -> Vec:
-    """Return the acceleration NED [m/s²] that the thrust setpoint stands for, gravity apart."""
-    w, x, y, z = state.attitude_setpoint.tolist()
-    north, east, down = rotate((w, x, y, z), (0.0, 0.0, state.thrust_setpoint / state.hover_thrust))
-    return -GRAVITY_M_S2 * north, -GRAVITY_M_S2 * east, GRAVITY_M_S2 * (1.0 - down)
 
 
 def _heading(yaw: float) -> Values:

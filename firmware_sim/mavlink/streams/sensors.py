@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 
 from airl_mav.core.constants import GRAVITY_M_S2
@@ -63,29 +62,6 @@ def mag_cal_report(value: Callable[[str], float]) -> Values | None:
         turned,
         turned,
         scale,
-    )
-
-
-def gps_raw_int(state: AutopilotState) -> Values | None:
-    """Newest GPS fix; nothing before the first. Dilution of precision is unknown."""
-    fix = state.gps
-    if fix is None:
-        return None
-    north, east, _ = fix.velocity_ned.tolist()
-    return (
-        state.time_us,
-        fix.fix_type,
-        units.deg_e7(fix.position.latitude_deg),
-        units.deg_e7(fix.position.longitude_deg),
-        units.mm(fix.position.altitude_m),
-        units.UINT16_MAX,
-        units.UINT16_MAX,
-        units.uint16(math.hypot(north, east) * 100.0),
-        units.centidegrees(math.atan2(east, north)),
-        units.saturate(fix.satellites, 0, 254, 255),
-        units.mm(fix.position.altitude_m),
-        units.uint32(fix.eph_m * 1e3),
-        units.uint32(fix.epv_m * 1e3),
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
 
 from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Landed
 from firmware_sim.autopilot.mode_numbers import custom_mode
@@ -155,25 +155,30 @@ def sys_status(state: AutopilotState) -> Values:
     )
 
 
-def _health(state: AutopilotState) -> Iterator[tuple[bool, int]]:
-    """Yield what may fail, and its bits: whether it is good."""
+def _health(state: AutopilotState) -> Sequence[tuple[bool, int]]:
+    """Return what may fail, and its bits: whether it is good."""
     health = state.health
     fixed = state.gps is not None and state.gps.fix_type >= dialect.GPS_FIX_TYPE_3D_FIX
-    attitude = health.attitude and _knows(state)
-    yield health.gyro, dialect.MAV_SYS_STATUS_SENSOR_3D_GYRO
-    yield health.accel, dialect.MAV_SYS_STATUS_SENSOR_3D_ACCEL
-    yield health.mag and bool(state.mag.any()), dialect.MAV_SYS_STATUS_SENSOR_3D_MAG
-    pressure = health.baro and state.pressure_hpa > 0.0
-    yield pressure, dialect.MAV_SYS_STATUS_SENSOR_ABSOLUTE_PRESSURE
-    yield health.gps and fixed, dialect.MAV_SYS_STATUS_SENSOR_GPS
-    yield attitude, dialect.MAV_SYS_STATUS_AHRS
-    yield attitude, dialect.MAV_SYS_STATUS_SENSOR_ATTITUDE_STABILIZATION
-    located = health.position and _knows(state)
-    yield located, dialect.MAV_SYS_STATUS_SENSOR_XY_POSITION_CONTROL
-    yield health.battery, dialect.MAV_SYS_STATUS_SENSOR_BATTERY
-    yield state.sticks is not None, _RADIO
+    known = _knows(state)
+    attitude = health.attitude and known
+    parts = [
+        (health.gyro, dialect.MAV_SYS_STATUS_SENSOR_3D_GYRO),
+        (health.accel, dialect.MAV_SYS_STATUS_SENSOR_3D_ACCEL),
+        (health.mag and bool(state.mag.any()), dialect.MAV_SYS_STATUS_SENSOR_3D_MAG),
+        (
+            health.baro and state.pressure_hpa > 0.0,
+            dialect.MAV_SYS_STATUS_SENSOR_ABSOLUTE_PRESSURE,
+        ),
+        (health.gps and fixed, dialect.MAV_SYS_STATUS_SENSOR_GPS),
+        (attitude, dialect.MAV_SYS_STATUS_AHRS),
+        (attitude, dialect.MAV_SYS_STATUS_SENSOR_ATTITUDE_STABILIZATION),
+        (health.position and known, dialect.MAV_SYS_STATUS_SENSOR_XY_POSITION_CONTROL),
+        (health.battery, dialect.MAV_SYS_STATUS_SENSOR_BATTERY),
+        (state.sticks is not None, _RADIO),
+    ]
     if health.distance is not None:
-        yield health.distance, _RANGES
+        parts.append((health.distance, _RANGES))
+    return parts
 
 
 def estimator_status(state: AutopilotState) -> Values:

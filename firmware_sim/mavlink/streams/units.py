@@ -72,7 +72,7 @@ def centidegrees(angle_rad: float) -> int:
     return round(math.degrees(angle_rad % TWO_PI) * 100.0) % 36_000
 
 
-for _function in (saturate, int16, int32, boot_ms, deg_e7, mm, cm_s, centidegrees):
+for _function in (saturate, int16, int32, uint16, uint32, boot_ms, deg_e7, mm, cm_s, centidegrees):
     register_jitable(_function)  # so that kernels can call them, as Python can
 
 

@@ -1,4 +1,4 @@
-"""What a command can be asked to require of its flights, and what it then leaves for a CI job."""
+"""Options that commands share: requirements, the live view, a recording in place of a run."""
 
 from __future__ import annotations
 
@@ -7,13 +7,24 @@ from typing import TYPE_CHECKING, Annotated
 
 from pydantic import Field
 
-from airl_mav.cli.options import REPEATED
+from airl_mav.black_box.messages import SUFFIX
+from airl_mav.cli.options import REPEATED, check_installed
 from airl_mav.core.errors import FieldError
-from airl_mav.core.fields import ProfileModel
+from airl_mav.core.fields import ProfileModel, quantity
+from airl_mav.scenario.aircraft import GREATEST_PORT
+from airl_mav.view.ends import ViewRequest
 
 if TYPE_CHECKING:
     from airl_mav.flight.requirements import Requirement
     from airl_mav.report.verdict import OverallVerdict
+
+
+TrustArenas = Annotated[
+    bool,
+    Field(
+        description="run the arena generators that the runs name: code of whoever made the folder"
+    ),
+]
 
 
 class Gate(ProfileModel):
@@ -58,3 +69,43 @@ def leave(gate: Gate, verdict: OverallVerdict, suite: str) -> None:
         write_junit(verdict, gate.junit, suite)
     if gate.badge is not None:
         write_badge(verdict, gate.badge)
+
+
+class Viewing(ProfileModel):
+    """Whether flights are watched."""
+
+    view: bool = Field(
+        default=False,
+        description="show the flights in a browser while they fly, at an address that is printed"
+        " (docs/how-to/view.md); in lockstep they fly in real time unless --speed says otherwise",
+    )
+    view_port: int | None = quantity(
+        "TCP port of that page on the loopback address; by default a free one",
+        "1",
+        ge=1,
+        le=GREATEST_PORT,
+        default=None,
+    )
+
+
+def view_of(options: Viewing) -> ViewRequest | None:
+    """Return the requested live view or None; UsageError for missing packages."""
+    if not options.view:
+        if options.view_port is not None:
+            raise FieldError(
+                "view_port", options.view_port, problem="accepted: together with --view"
+            )
+        return None
+    check_installed("view")
+    return ViewRequest(options.view_port)
+
+
+def folder_of(path: Path, ulg: Path | None = None) -> Path:
+    """Return a run's folder, made of a black box and its log if need be, or raise UsageError."""
+    if path.suffix != SUFFIX or path.is_dir():
+        return path
+    check_installed("black-box" if ulg is None else "refit")
+    # Imported here: MCAP is an extra.
+    from airl_mav.report.recording_folder import take_in
+
+    return take_in(path, ulg)
