@@ -8,7 +8,7 @@ import os
 import re
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -16,6 +16,7 @@ import numba
 from numba import njit
 from numba.core import event
 from numba.core.caching import FunctionCache
+from numba.core.dispatcher import Dispatcher
 
 from airl_mav.core.cache import writable_folder
 from airl_mav.core.compiling import report_compiling
@@ -166,7 +167,14 @@ def _compiled(function: F, *, forceinline: bool, counts: bool = True) -> F:
     compiled = njit(**options)(function)
     with _caching_in(cache_folder(function.__code__.co_filename)):
         compiled._cache = _Cache(function)
+    compiled.get_call_template = partial(_call_template, compiled)
     return cast(F, compiled)
+
+
+def _call_template(compiled: Dispatcher, args: Iterable[Any], kws: dict[str, Any]) -> Any:
+    """Return how a kernel is called from others: compiled once for all values of a constant."""
+    types = map(numba.types.unliteral, args)
+    return Dispatcher.get_call_template(compiled, tuple(types), kws)
 
 
 class _Cache(FunctionCache):  # type: ignore[misc]
