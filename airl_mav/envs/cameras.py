@@ -292,7 +292,7 @@ def _make_noisy(
 
 @large_kernel
 def render_images(
-    fleet: Fleet | Seen, arenas: ArenaBatch, who: NDArray[np.bool_], eye: Eye
+    fleet: Fleet | Seen, arenas: ArenaBatch, who: NDArray[np.bool_], eye: Eye | None
 ) -> None:
     """Render the depth image of every vehicle in `who`, from where it is now.
 
@@ -301,8 +301,10 @@ def render_images(
         arenas: One a vehicle; moving obstacles are put where they are at its time.
         who: (n,) whose image is rendered; the others' stays as it is.
         eye: The camera. Its image is written: depth [mm], 0 = no return, rounded and clipped as
-            `camera.frame.depth_to_z16` does.
+            `camera.frame.depth_to_z16` does. None: nothing is rendered.
     """
+    if eye is None:
+        return
     lens = eye.lens
     image = np.empty(eye.image.shape[1:], np.float32)
     for i in range(len(who)):

@@ -232,19 +232,12 @@ def hover(
     fleet.verdict[i] = Verdict.FLYING
 
 
-Lanes = tuple[int, ...]
-"""Lanes, of which the length alone matters: a kernel is compiled for each, with loops of as many
-turns, which the compiler knows."""
-
-LANES: Lanes = (0, 1, 2, 3)
-"""Those in which several vehicles fly a tick together: as many as AVX2 has doubles in a register.
-With eight, a thousand vehicles fly 2 to 4 % faster and a few take 1.5 times as long."""
-
-ALONE: Lanes = (0,)
-"""That of a single vehicle, which takes a quarter less than in the first of `LANES`."""
+LANES = 4
+"""How many vehicles fly a tick together: as many doubles as AVX2 has in a register. With eight, a
+thousand vehicles fly 2 to 4 % faster and a single one takes 1.5 times as long."""
 
 State = NDArray[np.float64]
-"""(ROWS, lanes): a column is a vehicle."""
+"""(ROWS, LANES): a column is a vehicle."""
 
 # Rows that are the vehicle's between two ticks; see `Fleet`.
 POSITION, VELOCITY, ATTITUDE, RATES, ROTOR, FELT = 0, 3, 6, 10, 13, 17

@@ -4,7 +4,7 @@ The same kernels as the rehearsal (`airl_mav.vehicle`, `airl_mav.control`), with
 MAVLink: control sees the true state. A setpoint in the heading frame is turned into NED when it
 arrives and again at each of MAVSDK's 20 Hz repeats, as PX4 does it.
 
-A few vehicles fly each tick together (`lanes`); when one has flown its ticks, or its flight is
+A few vehicles fly each tick together (`LANES`); when one has flown its ticks, or its flight is
 over, the next takes its place. What calls functions that have no vector form, or is rarely needed,
 stands in loops of its own between those that are compiled to vector instructions.
 """
@@ -44,8 +44,16 @@ from airl_mav.control.memory import (
 from airl_mav.control.mixer import allocate, desaturate
 from airl_mav.core.constants import TICK_S, TICK_US
 from airl_mav.core.kernels import borrowing_kernel, kernel, large_kernel
-from airl_mav.envs.arenas import NOTHING, ArenaBatch, clearance, move_obstacles, relief_of, touches
-from airl_mav.envs.decision import Decision, next_stretch
+from airl_mav.envs.arenas import (
+    NOTHING,
+    ArenaBatch,
+    clearance,
+    move_all_obstacles,
+    move_obstacles,
+    relief_of,
+    touches,
+)
+from airl_mav.envs.decision import Decision, FrameTimes, Timing, new_decision, next_stretch
 from airl_mav.envs.fleet import (
     AIRFRAME,
     AIRFRAME_SIZE,
@@ -78,7 +86,6 @@ from airl_mav.envs.fleet import (
     WIND,
     YAW_RATE,
     Fleet,
-    Lanes,
     Rules,
     State,
     Vehicle,
@@ -113,7 +120,6 @@ _BATTERY = int(Verdict.BATTERY)
 _TIMEOUT = int(Verdict.TIMEOUT)
 
 
-@kernel
 def advance(
     fleet: Fleet,
     arenas: ArenaBatch,
@@ -139,10 +145,16 @@ def advance(
         air: (n, k, 3) wind NED [m/s]; of the k rows each tick since the start of a flight takes the
             next, after the last one the first again. None, or k = 0: calm.
     """
-    fly(fleet, arenas, ticks.copy(), vehicle, rules, air, None, LANES)
-    for i in range(len(ticks)):
-        if ticks[i] > 0:
-            move_obstacles(arenas, i, fleet.time_us[i])
+    n, never = len(ticks), np.zeros((0, 3), np.int64)
+    timing = Timing(False, 0, 0, -1, -1, 0.0, never, FrameTimes(np.zeros(n, np.int64), 1, 0, never))
+    nothing = new_decision(timing, np.zeros((n, 9)))
+    todo = np.where(fleet.verdict == _FLYING, ticks, 0)
+    fly(
+        *(fleet, arenas, todo, vehicle, rules),
+        np.zeros((n, 0, 3)) if air is None else air,
+        nothing,
+    )
+    move_all_obstacles(arenas, fleet.time_us)
 
 
 @large_kernel
@@ -152,31 +164,30 @@ def fly(
     todo: NDArray[np.int64],
     vehicle: Vehicle,
     rules: Rules,
-    air: NDArray[np.float64] | None,
-    decision: Decision | None,
-    lanes: Lanes,
+    air: NDArray[np.float64],
+    decision: Decision,
 ) -> None:
-    """Fly vehicles as `advance` does, as many at a time as there are `lanes`.
+    """Fly vehicles as `advance` does, `LANES` at a time, where `todo` is not 0; it becomes 0.
 
-    With a `decision`, decisions are flown to their end or to where Python is needed, of vehicles
-    whose `todo` is not 0. It becomes 0. Moving obstacles are moved where they matter.
+    A vehicle whose decision has events flies it to its end, or to where Python is needed; another
+    one flies `todo` ticks. Moving obstacles are moved where they matter.
     """
     weights, kept = filters(vehicle.gains, TICK_S), felt_share(vehicle.power, TICK_S)
     # Made here with sizes that are constants: so the compiler knows that no two rows overlap.
-    state, spare = np.zeros((ROWS, len(lanes))), np.zeros((MEMORY_SIZE, len(lanes)))
-    who, left = np.full(len(lanes), _NOBODY), np.zeros(len(lanes), np.int64)
+    state, spare = np.zeros((ROWS, LANES)), np.zeros((MEMORY_SIZE, LANES))
+    who, left = np.full(LANES, _NOBODY), np.zeros(LANES, np.int64)
     # Those whose position loops are due at the same ticks fly together: one loop runs for all.
     coming, odd = np.zeros(2, np.int64), 0
     while True:
         aloft = _fill(fleet, decision, todo, coming, odd, who, left, state)
         if aloft == 0:
             return
-        for j in range(len(lanes)):
+        for j in range(LANES):
             i = who[j]
             if i != _NOBODY:
                 if fleet.time_us[i] >= fleet.repeat_us[i]:
                     _repeat(fleet, i, state, j)
-                if air is not None and air.shape[1] > 0:
+                if air.shape[1] > 0:
                     _blow(air[i], fleet.time_us[i], state, j)
         by_rates = _outer_loops(state, spare, who, aloft, vehicle.gains, weights)
         if by_rates:
@@ -186,7 +197,7 @@ def fly(
             _keep_rates(state, who)
         odd ^= 1
         _move(state, vehicle, kept)
-        for j in range(len(lanes)):
+        for j in range(LANES):
             i = who[j]
             if i != _NOBODY:
                 here, hit = vec(state, POSITION, j), NOTHING
@@ -206,7 +217,7 @@ def fly(
 @borrowing_kernel
 def _fill(
     fleet: Fleet,
-    decision: Decision | None,
+    decision: Decision,
     todo: NDArray[np.int64],
     coming: NDArray[np.int64],
     odd: int,
@@ -222,50 +233,37 @@ def _fill(
     for j in range(len(who)):
         while who[j] == _NOBODY or left[j] == 0:
             if who[j] != _NOBODY:
-                left[j] = _stretch(decision, fleet, who[j], state, j)
+                left[j] = next_stretch(decision, fleet, who[j], state, j)
                 if left[j] == 0:
                     unload(fleet, who[j], state, j)
                     who[j] = _NOBODY
                 continue
-            every = decision is not None
-            i = _next(todo, every, fleet.verdict, fleet.memory, odd, coming)
+            i = _next(todo, fleet.memory, odd, coming)
             if i == _NOBODY:
-                i = _next(todo, every, fleet.verdict, fleet.memory, odd ^ 1, coming)
+                i = _next(todo, fleet.memory, odd ^ 1, coming)
             if i == _NOBODY:
                 break
             load(fleet, i, state, j)
-            who[j], left[j], todo[i] = i, 0 if every else todo[i], 0
+            who[j], left[j], todo[i] = i, 0 if decision.events[i] > 0 else todo[i], 0
         aloft += who[j] != _NOBODY
     return aloft
 
 
 @borrowing_kernel
-def _stretch(decision: Decision | None, fleet: Fleet, i: int, state: State, j: int) -> int:
-    """Return how many ticks vehicle i, in lane j, flies next; 0: none."""
-    if decision is None:
-        return 0
-    return next_stretch(decision, fleet, i, state, j)
-
-
-@borrowing_kernel
 def _next(
     todo: NDArray[np.int64],
-    every: bool,
-    verdict: NDArray[np.int64],
     memory: NDArray[np.float64],
     odd: int,
     coming: NDArray[np.int64],
 ) -> int:
     """Return the next vehicle that has to fly and whose position loop is due now, or nobody.
 
-    Where `odd` is 1, it is due a tick later. `coming` (2,) is where the search resumes for both. Of
-    decisions, `every` one is carried out, also where the flight is over.
+    Where `odd` is 1, it is due a tick later. `coming` (2,) is where the search resumes for both.
     """
     while coming[odd] < len(todo):
         i: int = coming[odd]
         coming[odd] += 1
-        flies = todo[i] > 0 and (every or verdict[i] == _FLYING)
-        if flies and (memory[i, WAIT] != 0.0) == (odd == 1):
+        if todo[i] > 0 and (memory[i, WAIT] != 0.0) == (odd == 1):
             return i
     return _NOBODY
 
@@ -310,7 +308,7 @@ def _outer_loops(
 ) -> bool:
     """Run the first half of `cascade_tick` in every lane: to what the attitude loop flies.
 
-    `spare` (MEMORY_SIZE, lanes) is room to work in, `who` (lanes,) the vehicle in each lane or
+    `spare` (MEMORY_SIZE, LANES) is room to work in, `who` (LANES,) the vehicle in each lane or
     nobody, `aloft` the number of vehicles, `weights` is `filters(gains, TICK_S)`. Return whether
     body rates are commanded in any lane; there nothing is run but a filter.
     """

@@ -28,8 +28,6 @@ from airl_mav.envs.episode_arenas import EpisodeArenas
 from airl_mav.envs.estimation import Telemetry
 from airl_mav.envs.faults import delays_of, later_us, twin_faults
 from airl_mav.envs.fleet import (
-    ALONE,
-    LANES,
     STILL,
     Fleet,
     Flights,
@@ -178,7 +176,6 @@ class Navigation(Stateful):
         self._decision = new_decision(self._times(pipelined=pipelined), self._telemetry.errors)
         self._stops = trace is not None or self._winds.gusty or self.cameras.may_freeze
         """Whether Python may be needed while a decision is flown."""
-        self._lanes = ALONE if n == 1 else LANES
         own = spec.reward not in SHIPPED_REWARDS
         self._reward = -1 if own else SHIPPED_REWARDS.index(spec.reward)
         self._world: World | None = None
@@ -468,7 +465,6 @@ class Navigation(Stateful):
             *(self.fleet, self._places.batch, self._vehicle, self._rules, self._decision),
             *(self._delays.block, self._extra_us, self._number, self._winds.air, self._drift),
             *(eye, self._encoding, self._reward, self.spec.episode.hold_s),
-            self._lanes,
         )
         return self._world
 
@@ -476,7 +472,7 @@ class Navigation(Stateful):
         """Compile how decisions are flown, or load it; nobody flies."""
         fly(
             *(self.fleet, self._places.batch, np.zeros(self.n, np.int64), self._vehicle),
-            *(self._rules, self._winds.air, self._decision, self._lanes),
+            *(self._rules, self._winds.air, self._decision),
         )
 
     def _look_ahead(self, who: NDArray[np.bool_]) -> None:

@@ -8,17 +8,14 @@ from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.profiles.camera_kind import CameraKind
 
-_N = 2
-"""Vehicles: a single one flies by kernels of its own."""
-
 
 def compile_vectorized(kind: CameraKind) -> None:
     """Compile the whole: a flight of some decisions."""
     flying = _navigation(kind)
-    flying.begin(range(_N), range(1, 1 + _N))
+    flying.begin([0], [1])
     for _ in range(3):
         flying.observe()
-        flying.fly(np.zeros((_N, 3)))
+        flying.fly(np.zeros((1, 3)))
 
 
 def compile_dynamics() -> None:
@@ -32,4 +29,4 @@ def compile_images(kind: CameraKind) -> None:
 
 
 def _navigation(kind: CameraKind) -> Navigation:
-    return Navigation(EnvironmentSpec.model_validate({"camera": {"kind": kind}}), _N)
+    return Navigation(EnvironmentSpec.model_validate({"camera": {"kind": kind}}), 1)

@@ -22,7 +22,7 @@ from airl_mav.envs.decision import Decision, plan
 from airl_mav.envs.draws import BLOCK
 from airl_mav.envs.encoding import EncodedBody, encode_body
 from airl_mav.envs.estimation import Drift, step_error
-from airl_mav.envs.fleet import Fleet, Lanes, Rules, Seen, Vehicle, Verdict
+from airl_mav.envs.fleet import Fleet, Rules, Vehicle, Verdict
 from airl_mav.envs.flight import fly
 from airl_mav.envs.rewards import pay
 from airl_mav.policy.images import Bytes
@@ -61,7 +61,6 @@ class World(structref.StructRefProxy):  # type: ignore[misc]
     reward: int
     """As of `rewards.pay`."""
     hold_s: float
-    lanes: Lanes
 
     def __new__(cls, *parts: Any) -> World:  # noqa: D102
         made: World = _made(*parts)
@@ -106,10 +105,10 @@ def decide(
         plan(decision, fleet)
     todo = (decision.next < decision.events).astype(np.int64)
     going = todo.copy()
-    fly(fleet, w.arenas, todo, w.vehicle, w.rules, w.air, decision, w.lanes)
+    fly(fleet, w.arenas, todo, w.vehicle, w.rules, w.air, decision)
     waiting = _end(decision, fleet, w.drift, w.number, going)
     if waiting == 0:
-        _look(decision.seen, w.arenas, w.eye)
+        render_images(decision.seen, w.arenas, np.ones(len(todo), np.bool_), w.eye)
         status(fleet, goal, numbers, whole)
         _judge(decision, commands, numbers, whole, w.reward, w.hold_s)
         if len(seen.depth) > 0:
@@ -160,12 +159,6 @@ def _end(
             if drift is not None:
                 step_error(drift, decision.errors, i, number[i], ticks)
     return waiting
-
-
-@kernel
-def _look(seen: Seen, arenas: ArenaBatch, eye: Eye | None) -> None:
-    if eye is not None:
-        render_images(seen, arenas, np.ones(len(seen.time_us), np.bool_), eye)
 
 
 @kernel

@@ -41,8 +41,8 @@ def vectorized_plan(kind: CameraKind) -> CompilePlan:
         "vectorized",
         kind,
         (
-            CompileJob(f"{_VECTORIZED}:compile_images", {"kind": kind}, 49),
-            CompileJob(f"{_VECTORIZED}:compile_dynamics", {}, 102),
+            CompileJob(f"{_VECTORIZED}:compile_images", {"kind": kind}, 51),
+            CompileJob(f"{_VECTORIZED}:compile_dynamics", {}, 100),
         ),
-        CompileJob(f"{_VECTORIZED}:compile_vectorized", {"kind": kind}, 5),
+        CompileJob(f"{_VECTORIZED}:compile_vectorized", {"kind": kind}, 23),
     )

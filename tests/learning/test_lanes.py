@@ -134,7 +134,7 @@ def commanded(fleet: Fleet, rng: np.random.Generator, by_rates: float = 0.0) -> 
         fleet.setpoint[fleet.by_rates] = rates[fleet.by_rates]
 
 
-@pytest.mark.parametrize("n", [1, len(LANES), 3 * len(LANES) + 1])
+@pytest.mark.parametrize("n", [1, LANES, 3 * LANES + 1])
 @pytest.mark.parametrize("windy", [False, True])
 @pytest.mark.parametrize("by_rates", [0.0, 0.5, 1.0])
 def test_together_as_alone(n: int, windy: bool, by_rates: float) -> None:
@@ -168,7 +168,7 @@ def test_together_as_alone(n: int, windy: bool, by_rates: float) -> None:
 
 def test_the_motors_of_these_flights_saturate() -> None:
     """Or the flights above would not show that those are mixed alike."""
-    n = 4 * len(LANES)
+    n = 4 * LANES
     rng = np.random.default_rng(5)
     fleet, arenas = fleet_of(n, rng), arenas_of(n, "no-obstacles")
     saturated = 0
@@ -183,7 +183,7 @@ def test_the_motors_of_these_flights_saturate() -> None:
 @pytest.mark.parametrize("arena", ["static-obstacles", "dynamic-obstacles"])
 def test_neither_order_nor_company_matters(arena: str) -> None:
     """Flights to their ends, some early: in another order, and one vehicle at a time."""
-    n = 5 * len(LANES) + 2
+    n = 5 * LANES + 2
     order = np.random.default_rng(1).permutation(n)
     flown = []
     for rows in (np.arange(n), order):
@@ -214,7 +214,7 @@ def test_neither_order_nor_company_matters(arena: str) -> None:
 
 
 def test_who_has_landed_is_left_alone() -> None:
-    n = len(LANES) + 1
+    n = LANES + 1
     fleet, arenas = fleet_of(n, np.random.default_rng(3)), arenas_of(n, "no-obstacles")
     fleet.verdict[2] = Verdict.COLLISION
     before = [array[2].copy() for array in fleet]
