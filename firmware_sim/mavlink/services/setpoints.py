@@ -173,8 +173,12 @@ def _thrust(message: WireMessage) -> float:
 
 def _masked(values: tuple[float, float, float], ignore: int) -> Vector:
     """Return the commanded vector (3,); NaN where ignored or not a finite number."""
+    isfinite, nan = math.isfinite, math.nan
     return np.array(
-        [math.nan if ignore >> i & 1 else _finite(value) for i, value in enumerate(values)]
+        [
+            value if isfinite(value) and not ignore >> i & 1 else nan
+            for i, value in enumerate(values)
+        ]
     )
 
 
@@ -184,7 +188,7 @@ def _turned(velocity: Vector, quaternion: Vector) -> Vector:
 
 
 def _commands_something(*vectors: Vector) -> bool:
-    return any(bool(np.isfinite(vector).any()) for vector in vectors)
+    return any(map(math.isfinite, np.concatenate(vectors).tolist()))
 
 
 def _finite(value: float) -> float:
