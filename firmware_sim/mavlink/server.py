@@ -30,7 +30,7 @@ from firmware_sim.mavlink.radio import Radio
 from firmware_sim.mavlink.senders import Senders
 from firmware_sim.mavlink.services import handle, peers, send_pending
 from firmware_sim.mavlink.services.context import Context
-from firmware_sim.mavlink.services.running_calibration import RunningCalibration
+from firmware_sim.mavlink.services.transfers import RunningCalibration
 from firmware_sim.mavlink.streams import BUILDERS, Builder
 from firmware_sim.mavlink.streams.status import system_time
 from firmware_sim.mavlink.telemetry import context_of, flown_of

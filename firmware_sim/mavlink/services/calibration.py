@@ -16,9 +16,8 @@ from firmware_sim.autopilot.autopilot_state import Arming, Message, Result, Seve
 from firmware_sim.autopilot.events import command_events as events
 from firmware_sim.interfaces import SensorSample
 from firmware_sim.mavlink.codec import dialect
-from firmware_sim.mavlink.services.command import Action, Command
-from firmware_sim.mavlink.services.context import Context
-from firmware_sim.mavlink.services.running_calibration import Step
+from firmware_sim.mavlink.services.context import Action, Command, Context
+from firmware_sim.mavlink.services.transfers import Step
 
 MOVING_RAD_S = 0.2
 """A body rate that counts as motion [rad/s]."""

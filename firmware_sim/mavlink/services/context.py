@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from airl_mav.core.signing import Signing
-from firmware_sim.autopilot.autopilot_state import Message
+from firmware_sim.autopilot.autopilot_state import Message, Result
 from firmware_sim.autopilot.port import AutopilotPort
 from firmware_sim.mavlink.codec import COMPONENT_ID, SYSTEM_ID, WireMessage
 from firmware_sim.mavlink.event_buffer import EventBuffer
 from firmware_sim.mavlink.link import Link
 from firmware_sim.mavlink.radio import Radio
-from firmware_sim.mavlink.services.ftp_session import FtpClient
-from firmware_sim.mavlink.services.log_transfer import LogDownload, LogListing, LogStream
-from firmware_sim.mavlink.services.mission_transfer import MissionTransfer
-from firmware_sim.mavlink.services.running_calibration import RunningCalibration
-from firmware_sim.mavlink.services.shell_session import Shell
+from firmware_sim.mavlink.services.transfers import (
+    FtpClient,
+    LogDownload,
+    LogListing,
+    LogStream,
+    MissionTransfer,
+    RunningCalibration,
+    Shell,
+)
 from firmware_sim.storage import Storage
 
 ANY = 0
@@ -33,7 +38,7 @@ class Context:
     now_us: int
     """Simulated time [µs]."""
     announce: Callable[[Message], None]
-    """Sends a text to the operators, to all clients of all links; and its event, if it is one.
+    """Sends a text to the operators, to all clients of all links. And its event, if it is one.
     Events are part of the telemetry: where an answer to a client must not change that, in lockstep,
     it is a text alone."""
     broadcast: Callable[[str, bytes], None]
@@ -82,6 +87,12 @@ class Context:
             or self.log_stream is not None
         )
 
+    def announce_once(self, refusal: Message) -> None:
+        """Announce why a message is refused, unless that was announced already."""
+        if refusal.text not in self.refusals:
+            self.refusals.add(refusal.text)
+            self.announce(refusal)
+
     def close(self) -> None:
         """Release what is held for the client: it has gone, or another autopilot comes."""
         self.ftp.close()
@@ -90,8 +101,7 @@ class Context:
 def for_vehicle(message: WireMessage, context: Context) -> bool:
     """Return whether a message is addressed to this vehicle, its autopilot or all components."""
     system: int = message.target_system
-    component: int = message.target_component
-    return system == context.system_id and component in (COMPONENT_ID, ANY)
+    return system == context.system_id and message.target_component in (COMPONENT_ID, ANY)
 
 
 def for_vehicle_or_all(message: WireMessage, context: Context) -> bool:
@@ -104,3 +114,26 @@ def for_vehicle_or_all(message: WireMessage, context: Context) -> bool:
 def sender(message: WireMessage) -> tuple[int, int]:
     """Return the system and component id of a message's sender."""
     return message.get_srcSystem(), message.get_srcComponent()
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """A COMMAND_LONG or COMMAND_INT."""
+
+    number: int
+    """MAV_CMD."""
+    params: tuple[float, float, float, float, float, float, float]
+    """Parameters 1..7 of COMMAND_LONG; NaN = not given."""
+    sender: tuple[int, int] = (0, 0)
+    """System and component id of who asks."""
+    frame: int | None = None
+    """MAV_FRAME of a COMMAND_INT."""
+
+    def integer(self, number: int) -> int | None:
+        """Return parameter 1..7 rounded, None when it is not a finite number."""
+        value = self.params[number - 1]
+        return round(value) if math.isfinite(value) else None
+
+
+Action = Callable[[Command, Context], "Result | None"]
+"""Carries out a command and returns the answer; None: it is not acknowledged, as by PX4."""

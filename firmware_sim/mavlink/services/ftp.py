@@ -15,7 +15,7 @@ from firmware_sim.mavlink.codec import WireMessage
 from firmware_sim.mavlink.services import component_metadata
 from firmware_sim.mavlink.services.context import Context, sender
 from firmware_sim.mavlink.services.ftp_files import DATA_BYTES, OPERATIONS, Checksum, read_at
-from firmware_sim.mavlink.services.ftp_session import (
+from firmware_sim.mavlink.services.transfers import (
     SESSION,
     Burst,
     Code,

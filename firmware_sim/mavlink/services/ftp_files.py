@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from firmware_sim.mavlink.crc32 import crc32part
-from firmware_sim.mavlink.services.ftp_session import Code, RefusedError, Request, Session
+from firmware_sim.mavlink.services.transfers import Code, RefusedError, Request, Session
 from firmware_sim.storage import Storage
 
 DATA_BYTES = 239

@@ -1,6 +1,6 @@
 """Commands that do nothing here and are answered as a running PX4 1.16 SITL answers them.
 
-Some that PX4 accepts need no more than that (there is nothing to switch); some it hands to a part
+Some that PX4 accepts need no more than that (there is nothing to switch). Some it hands to a part
 of the vehicle that is not there, and so nobody acknowledges them.
 """
 
@@ -9,8 +9,7 @@ from __future__ import annotations
 from firmware_sim.autopilot.autopilot_state import Arming, Message, Result, Severity
 from firmware_sim.autopilot.events import command_events as events
 from firmware_sim.mavlink.codec import dialect
-from firmware_sim.mavlink.services.command import Action, Command
-from firmware_sim.mavlink.services.context import Context
+from firmware_sim.mavlink.services.context import Action, Command, Context
 
 ACCEPTED = (
     dialect.MAV_CMD_DO_SET_ACTUATOR,
