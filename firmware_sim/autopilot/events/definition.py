@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import struct
 from enum import IntEnum
+from functools import partial
 from typing import NamedTuple
 
 from firmware_sim.autopilot.events.enumerations import ENUMERATIONS
@@ -116,6 +117,26 @@ def sub_id(name: str) -> int:
 def arguments(*kinds_and_names: str) -> tuple[Argument, ...]:
     """Return arguments of "type name" each."""
     return tuple(Argument(*text.split()) for text in kinds_and_names)
+
+
+def define(
+    name: str,
+    message: str,
+    *listed: str,
+    level: Level = Level.INFO,
+    internal: Level | None = None,
+    description: str = "",
+    kind: str = "",
+) -> Definition:
+    """Return a definition with arguments of "type name" each."""
+    return Definition(
+        name, message, arguments(*listed), level, internal, description=description, kind=kind
+    )
+
+
+critical = partial(define, level=Level.CRITICAL, internal=Level.INFO)
+error = partial(define, level=Level.ERROR, internal=Level.INFO)
+warning = partial(define, level=Level.WARNING, internal=Level.INFO)
 
 
 def _fitted(value: float, of: str) -> float:
