@@ -89,7 +89,7 @@ def _build(
 ) -> int:
     """Write the tree over m boxes, `low` and `high` (m, 3); return its number of nodes.
 
-    `order` (m,) are the boxes' numbers, sorted by leaf; written are `bounds` (2 m - 1, 6), lowest
+    `order` (m,) are the boxes' numbers, sorted by leaf. Written are `bounds` (2 m - 1, 6), lowest
     and highest corner of each node, and `links` (2 m - 1, 2), as of `Bvh`.
     """
     waiting = np.empty((STACK + 1, 4), np.int64)  # begin, end, parent of a right child, level
@@ -324,14 +324,8 @@ def meshes_of(
 ) -> Meshes | None:
     """Return an arena's meshes, hills included; None without meshes, hills and glass.
 
-    Args:
-        placed: The meshes.
-        n_obstacles: Obstacles of the arena.
-        ground: Its hills.
-        clear: (n,) obstacles that depth passes through, `Arena.clear`; None = none, as for colour.
-
-    Raises:
-        UsageError: A file is missing or has changed.
+    Depth passes through the obstacles `clear` (n,), `Arena.clear`; None = none, as for colour.
+    Raises UsageError if a file is missing or has changed.
     """
     if not placed and ground is None and clear is None:
         return None

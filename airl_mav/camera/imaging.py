@@ -74,18 +74,10 @@ class ImageFormation:
         self._frame = 0
 
     def take(self, arena: Arena, elapsed_us: int, motion: Motion, seed: int, frame: int) -> Taken:
-        """Return an image.
+        """Return an image in the middle of its exposure and rows, `elapsed_us` after the start.
 
-        Args:
-            arena: The arena.
-            elapsed_us: Time since the episode's start, at the middle of the exposure and of the
-                rows [µs].
-            motion: Motion of the vehicle then.
-            seed: Seed of the episode.
-            frame: Number in the episode by the camera's rate, skipped frames included.
-
-        Raises:
-            UsageError: A mesh's file is missing or has changed.
+        `motion` is the vehicle's then, `seed` the episode's, `frame` the number by the camera's
+        rate, skipped frames included. Raises UsageError if a mesh's file is missing or has changed.
         """
         asked = self._imaging
         off = _off_by(asked, seed, self._own)

@@ -32,7 +32,7 @@ class Intrinsics:
       that of a pinhole of the same focal length.
     - fisheye: (sin b cos c, sin b sin c, cos b), at the angle b [rad] from the optical axis that
       `profiles.distortion` makes r / focal of, where r is the way from (cx, cy) to the pixel and c
-      its direction; without coefficients b is r / focal, equidistant. Depth is measured along that
+      its direction. Without coefficients b is r / focal, equidistant. Depth is measured along that
       unit vector. Pixels more than 95 degrees from the axis see nothing, nor do those beyond the
       angle to which the coefficients hold.
 

@@ -14,8 +14,19 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.camera.primitives import Ids, Line, Lines
-from airl_mav.camera.projection import Image, Pose, Rectangle, Span, View, cut, cylinder_span, dot
+from airl_mav.camera.primitives import Ids
+from airl_mav.camera.projection import (
+    Image,
+    Line,
+    Lines,
+    Pose,
+    Rectangle,
+    Span,
+    View,
+    cut,
+    cylinder_span,
+    dot,
+)
 from airl_mav.core.kernels import borrowing_kernel, kernel
 from airl_mav.vehicle.rotation import Vec
 

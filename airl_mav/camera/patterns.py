@@ -1,6 +1,6 @@
 """Where a point of a body lies in the pattern of its material, and which texel that is.
 
-Places are along the body's own axes [m]; the pattern is in metres, or in periods where it goes
+Places are along the body's own axes [m]. The pattern is in metres, or in periods where it goes
 round a body in a whole number of them. Inlined into the loops of `surfaces`, which vectorise.
 """
 

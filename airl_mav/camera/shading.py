@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.arena.appearance import TEXTURES
+from airl_mav.camera.gloss import Gloss
 from airl_mav.camera.textures import LEVELS, STRIDE
 from airl_mav.core.kernels import borrowing_kernel, kernel
 
@@ -85,15 +86,36 @@ class Lit(NamedTuple):
     extinction: np.float32
 
 
+class Look(NamedTuple):
+    """How an arena looks, as `colour.render_colour` takes it; and how wide pixels are."""
+
+    texture: NDArray[np.int8]  # (2 + n,)
+    per_m: NDArray[np.float32]  # (2 + n,)
+    offset: NDArray[np.float32]  # (2 + n, 2)
+    albedo: NDArray[np.float32]  # (2 + n, 2, 3)
+    gloss: Gloss | None
+    light: Lit
+    atlas: Plane
+    pixel2: np.float32
+    """Square of the side of a pixel at a depth of 1."""
+
+
+class Canvas(NamedTuple):
+    """An image that is shaded: its n pixels line after line, and room to work in."""
+
+    out: Packed  # (n,) written
+    ids: Packed  # (n,) what each pixel sees
+    far: Plane  # (n,) depth [m], 0: no surface
+    lit: Plane  # (n,) 1 in the sun, 0 in shadow
+    clear: Plane  # (n,) transmission of fog
+    rays: Rays
+    points: Points
+
+
 @borrowing_kernel
-def surface_of(
-    texture: NDArray[np.int8],
-    per_m: NDArray[np.float32],
-    offset: NDArray[np.float32],
-    albedo: NDArray[np.float32],
-    i: int,
-) -> Surface:
-    """Return row i of the arrays of materials."""
+def surface_of(look: Look, i: int) -> Surface:
+    """Return a row of the materials."""
+    texture, per_m, offset, albedo = look.texture, look.per_m, look.offset, look.albedo
     dark = (albedo[i, 0, 0], albedo[i, 0, 1], albedo[i, 0, 2])
     more = (
         albedo[i, 1, 0] - dark[0],
@@ -144,27 +166,19 @@ def irradiance(light: Lit, channel: int, direct: np.float32, rise: np.float32) -
 
 @borrowing_kernel
 def paint(
-    out: Packed,
-    seen: Packed,
-    lit: Plane,
-    clear: Plane,
+    canvas: Canvas,
+    look: Look,
+    surface: Surface,
     left: int,
     end: int,
     first: np.int32,
     last: np.int32,
-    points: Points,
-    surface: Surface,
-    light: Lit,
-    atlas: Plane,
 ) -> None:
-    """Write the packed sRGB of left..end where `seen` is first..last; Lambert's and Beer's laws.
-
-    `lit` (n,) is 1 in the sun, 0 in shadow, `clear` (n,) the transmission of fog, `points` are
-    those of the part, and `atlas` is `textures.atlas()`.
-    """
-    place, facing, up, pattern, green_of, blue_of = points
-    row, marks = out[left:end], seen[left:end]
-    lit_row, clear_row = lit[left:end], clear[left:end]
+    """Write the packed sRGB of left..end where first..last are seen; Lambert's and Beer's laws."""
+    place, facing, up, pattern, green_of, blue_of = canvas.points
+    light, atlas = look.light, look.atlas
+    row, marks = canvas.out[left:end], canvas.ids[left:end]
+    lit_row, clear_row = canvas.lit[left:end], canvas.clear[left:end]
     # By itself: a loop that reads from all over the atlas does not vectorise. Unsigned: of a number
     # with a sign it would ask each time whether it counts from the end.
     for u in range(end - left):

@@ -1,6 +1,6 @@
 """Textures: repeating patterns of numbers 0..1 with coarser levels (mip maps).
 
-A procedural pattern depends on its name alone; a picture from a file is three patterns. Surfaces
+A procedural pattern depends on its name alone. A picture from a file is three patterns. Surfaces
 differ in offset, size and albedos. Files are untrusted: two formats, of a size checked first.
 """
 
