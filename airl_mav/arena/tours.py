@@ -222,7 +222,7 @@ def _timed(
     """Return times [s] and places [m] of tours at constant speeds, and where each ends.
 
     `points` (k, 2) are the way-points of all tours [m], `counts` (m,) their numbers, `speeds` (m,)
-    [m/s], `legs` (k - 1,) the distances [m]; a stop at each point but the first takes `dwell_s`.
+    [m/s], `legs` (k - 1,) the distances [m]. A stop at each point but the first takes `dwell_s`.
     """
     stops = 1 if dwell_s > 0.0 else 0
     times, places = np.empty(len(points) * (1 + stops)), np.empty((len(points) * (1 + stops), 2))

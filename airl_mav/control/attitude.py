@@ -122,12 +122,8 @@ def rates_towards(
 ) -> Vec:
     """Return the body rates FRD [rad/s] that turn q into an attitude.
 
-    Args:
-        q: Body -> NED.
-        reduced: The attitude but for a turn about its thrust axis, body -> NED.
-        half_turn: The sine of half that turn.
-        yaw_rate_ff: Heading rate about the world's down axis [rad/s].
-        gains: Gains and limits.
+    `reduced` is that attitude but for a turn about its thrust axis, `half_turn` the sine of half
+    that turn, `yaw_rate_ff` the heading rate about the world's down axis [rad/s].
     """
     wanted = multiply(reduced, (math.sqrt(1.0 - half_turn * half_turn), 0.0, 0.0, half_turn))
     error = multiply(conjugate(q), wanted)

@@ -46,14 +46,9 @@ def new_memory(n: int | None = None) -> Memory:
 def trim_for_hover(
     memory: Memory, command: float, gains: Gains, north: float = 0.0, east: float = 0.0
 ) -> None:
-    """Set the integrals of the velocity to what they settle at in a hover.
+    """Set the integrals of the velocity to their steady values in a hover at a collective 0..1.
 
-    Args:
-        memory: Of one vehicle (MEMORY_SIZE,), updated.
-        command: Collective 0..1.
-        gains: Hold the hover thrust.
-        north: Acceleration that the vehicle leans for, against the wind [m/s²].
-        east: The same towards east.
+    `north` and `east` are the acceleration that the vehicle leans for, against the wind [m/s²].
     """
     # thrust_from_acceleration, solved for the acceleration that gives the command.
     upright = GRAVITY_M_S2 / math.hypot(GRAVITY_M_S2, north, east)
@@ -64,12 +59,9 @@ def trim_for_hover(
 
 
 def trim_against_torque(memory: Memory, motors: Motors, gains: Gains) -> None:
-    """Set the integrals of roll and pitch to what they settle at with these commands in a hover.
+    """Set the integrals of roll and pitch to their steady values in a hover.
 
-    Args:
-        memory: Of one vehicle (MEMORY_SIZE,), updated.
-        motors: Commands 0..1; equal ones need no torque.
-        gains: Hold the limits of the integrals, and how torque becomes commands.
+    `motors` are the commands 0..1 of that hover. Equal ones need no torque.
     """
     axes = (
         (ROLL, gains.mix_roll, gains.rate_int_max_roll),

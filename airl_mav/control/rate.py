@@ -28,16 +28,10 @@ def rate_control(
     gains: Gains,
     dt: float,
 ) -> tuple[Vec, Vec]:
-    """Return the torque setpoint (-1..1 per axis) and the new integral.
+    """Return the torque setpoint (-1..1 per axis) and the new integral, in torque units.
 
-    Args:
-        rates: Filtered body rates FRD [rad/s].
-        angular_acceleration: Filtered derivative of the rates [rad/s²].
-        rates_sp: Rates wanted [rad/s].
-        integral: Of each axis, in torque units.
-        saturation: Torque that the mixer could not deliver last time, per axis (sign matters).
-        gains: Rate gains.
-        dt: Time since the last call [s].
+    Rates [rad/s] and their derivative [rad/s²] are filtered, FRD; `saturation` is the torque per
+    axis that the mixer could not deliver last time (its sign matters).
     """
     er, ep, ey = rates_sp[0] - rates[0], rates_sp[1] - rates[1], rates_sp[2] - rates[2]
     torque = (

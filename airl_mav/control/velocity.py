@@ -88,7 +88,7 @@ def velocity_control(
     """Return the thrust vector (3,) NED and the new integral (3,) [m/s²].
 
     A NaN horizontal setpoint is not controlled: the vehicle stays level.
-    PID on velocity with anti-windup: vertical integration stops at the thrust limits; horizontal
+    PID on velocity with anti-windup: vertical integration stops at the thrust limits. Horizontal
     integration is pulled back by what saturation takes away (tracking anti-windup, gain 2/P).
     """
     ex = velocity_sp[0] - velocity[0]

@@ -26,14 +26,9 @@ class LogFile:
     """
 
     def __init__(self, path: Path, on_lost: Callable[[str], None] = lambda _: None) -> None:
-        """Open the file.
+        """Open the file of this final name. Raises OSError.
 
-        Args:
-            path: Its final name.
-            on_lost: Called once when it cannot be written any more: which file, and why.
-
-        Raises:
-            OSError: It cannot be opened.
+        `on_lost` is called once, with file and reason, when it cannot be written any more.
         """
         self.path = path
         self.on_lost = on_lost

@@ -44,12 +44,10 @@ class Signing:
     def __init__(
         self, calendar_us: Callable[[], int], key: bytes | None = None, timestamp: int = 0
     ) -> None:
-        """Begin with a key, or None: nothing is signed or asked for.
+        """Begin with a key of 32 bytes, or None: nothing is signed or required.
 
-        Args:
-            calendar_us: Returns the calendar time [µs since 1970].
-            key: 32 bytes.
-            timestamp: The newest time stamp that was used with the key [10 µs since 2015].
+        `calendar_us` returns the calendar time [µs since 1970], `timestamp` is the newest one that
+        was used with the key [10 µs since 2015].
         """
         self._calendar_us = calendar_us
         self.key = key
@@ -94,7 +92,7 @@ class Signing:
         return covered + self._signature(covered)
 
     def accepts(self, frame: bytes) -> bool:
-        """Return whether a frame may be taken; one that may is too old the next time.
+        """Return whether a frame may be taken. One that may is too old the next time.
 
         Without a key everything may. The frame's checksum is not looked at.
         """

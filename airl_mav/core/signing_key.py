@@ -59,14 +59,10 @@ class StoredSigning:
     """A `Signing` whose key and newest time stamp outlive the program."""
 
     def __init__(self, path: Path | None, clock: Clock | None = None) -> None:
-        """Read both.
+        """Read both; without a path there is no key at first, and nothing is stored.
 
-        Args:
-            path: The key's file; None: no key at first, and nothing is stored.
-            clock: Wall time, for how often the time stamp is written.
-
-        Raises:
-            FieldError: As `read_key`.
+        `clock` is wall time, for how often the time stamp is written. Raises FieldError as
+        `read_key`.
         """
         self._path = path
         self._clock = clock or WallClock()

@@ -13,14 +13,10 @@ FOREVER_US = 1 << 62
 
 
 def window_us(fault: Fault, entered_us: Mapping[str, int]) -> tuple[int, int] | None:
-    """Return from when to when a fault acts [µs since the start of the episode].
+    """Return begin and end, excluded, of a fault [µs since the start of the episode].
 
-    Args:
-        fault: The fault.
-        entered_us: When each phase of the flight began for the first time [µs since the start].
-
-    Returns:
-        Begin, included, and end, excluded; None: the phase that sets it off has not begun.
+    `entered_us` is when each phase of the flight began for the first time; None: the phase of the
+    fault has not begun.
     """
     origin_us = 0 if fault.phase is None else entered_us.get(fault.phase)
     if origin_us is None:

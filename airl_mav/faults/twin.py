@@ -14,9 +14,7 @@ TWIN = "gym"
 def check_twin(faults: Sequence[Fault], *, pipelined: bool = False) -> None:
     """Raise FieldError for a fault that the twin cannot fly.
 
-    Args:
-        faults: Of one flight.
-        pipelined: Whether decisions are: what comes later than the next one is not modelled then.
+    With pipelined decisions, delays beyond the next decision are not modelled.
     """
     for fault in faults:
         levels = fault.about.levels
@@ -35,7 +33,7 @@ def check_twin(faults: Sequence[Fault], *, pipelined: bool = False) -> None:
 def _in_flight(fault: Fault) -> bool:
     """Return whether it begins in the flight, or has acted since before it.
 
-    What ends before the policy takes over was never there; neither was the picture of the ground.
+    What ends before the policy takes over was never there. Neither was the picture of the ground.
     """
     from_the_start = fault.phase is None and not fault.at_s and fault.for_s is None
     return fault.phase == "offboard" or (from_the_start and fault.kind != "stuck")

@@ -127,7 +127,7 @@ def commands(spec: ActionSpec, actions: NDArray[Any]) -> NDArray[np.float64]:
     Args:
         spec: The action set.
         actions: (n,) whole numbers, from 0 on, of a discrete set; (n, 2) numbers of a continuous
-            one: of those shipped, forward and right speed, each -1..1 of the fastest; anything
+            one: of those shipped, forward and right speed, each -1..1 of the fastest. Anything
             beyond is cut off. Of a set of three dimensions (n, 3): also the downward speed, of
             the fastest climb (`actions.fastest_climb`). Of `body-rates` (n, 4): roll, pitch and
             yaw rate, each -1..1 of the greatest, and thrust, -1 for none to 1 for all.

@@ -18,7 +18,7 @@ from airl_mav.policy.model_card import MARK, MODEL_CARD_FILE, model_card
 
 
 def write_card(folder: Path, card: PolicyCard) -> None:
-    """Write the card beside the policy that it is for; the old card stays until the new is whole.
+    """Write the card beside the policy that it is for. The old card stays until the new is whole.
 
     Its page for people, `README.md`, is written after it, unless somebody else's has that name.
 

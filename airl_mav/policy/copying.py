@@ -24,13 +24,8 @@ def copy_policy(
 ) -> PolicyCard:
     """Write a policy's network to another folder, its card with changes, and return the card.
 
-    What was measured of the source is not its own: the card has no results until it is evaluated.
-
-    Args:
-        source: Folder of the policy.
-        out: Folder to write to; made if need be.
-        changes: Fields of the card, by name.
-        trust: Whether the source's maker may run code on this machine.
+    Measurements of the source do not apply: the card has no results until it is evaluated. `trust`
+    permits the source's maker to run code on this machine.
 
     Raises:
         UsageError: The policy cannot be used, a change is out of range, or `out` is the source or

@@ -3,8 +3,8 @@
 `body` is the default: the camera's image, and goal and velocity in the heading frame. `paper` is
 Air Learning's own input as its code has it: a 154 x 256 image whose top rows draw the bearing of
 the goal, and vectors in the world frame. `scan` is `body` with a level scan, as a planar lidar's,
-in place of the depth image; earlier frames are carried to where the vehicle is now. All are Dicts
-of the image, `velocity` and `goal`; the image's key is what the camera gives: `depth`, `rgb` or
+in place of the depth image. Earlier frames are carried to where the vehicle is now. All are Dicts
+of the image, `velocity` and `goal`. The image's key is what the camera gives: `depth`, `rgb` or
 `grey`. Images of further cameras follow, under KIND_NAME. Any other layout is the user's own
 (`own_layouts`).
 
@@ -120,7 +120,7 @@ def encode_layout(spec: ObservationSpec, seen: Observation, shrink: Shrink = NUM
 
     Raises:
         ValueError: The network is told of decisions of which nobody keeps account.
-        UsageError: A layout of the user's gives anything else than it says; or the network is told
+        UsageError: A layout of the user's gives anything else than it says. Or the network is told
             how high the goal is, and it has no height; or a further camera shows nothing.
     """
     if spec.layout not in SHIPPED:
@@ -239,14 +239,9 @@ def _part(name: Told, seen: Observation) -> NDArray[np.float64]:
 
 
 def newest_frame(spec: ObservationSpec, seen: Mapping[str, NDArray[Any]]) -> NDArray[np.uint8]:
-    """Return a copy of the newest frame that one vehicle's network sees, as a picture.
+    """Return a copy of the newest frame of one vehicle's arrays, as a picture (h, w) or (h, w, 3).
 
-    Args:
-        spec: The layout.
-        seen: Its arrays, without a leading axis.
-
-    Returns:
-        (h, w); of rgb (h, w, 3). A scan is as high as the camera's image would be.
+    A scan is as high as the camera's image would be.
     """
     channels = seen[spec.kind][: CHANNELS[spec.kind]]
     if spec.layout == "scan":
@@ -264,7 +259,7 @@ def ablated(encoded: Mapping[str, NDArray[Any]], key: str) -> Encoded:
 def _bearing_strip(spec: ObservationSpec, seen: Observation) -> NDArray[np.uint8]:
     """Return Air Learning's strip (n, 10, width): white, a black bar at the goal's bearing.
 
-    Bearings of -180..180 deg run from the left to the right edge; the last row is black.
+    Bearings of -180..180 deg run from the left to the right edge. The last row is black.
     """
     n, width = len(seen.goal), spec.width_px
     bearing = np.arctan2(seen.goal[:, 1], seen.goal[:, 0])

@@ -177,9 +177,7 @@ def encode(frame: Frame, state: Kinematics, goal: Goal) -> Observation:
 def views_of(frame: Frame, earlier: Sequence[Mapping[str, NDArray[Any]]] = ()) -> dict[str, View]:
     """Return what the further cameras of a frame show.
 
-    Args:
-        frame: The frame.
-        earlier: The images of the decisions before by camera, the newest first.
+    `earlier` are the images of the decisions before by camera, the newest first.
     """
     return {
         name: View(each.image, each.intrinsics, tuple(then[name] for then in earlier))
@@ -198,14 +196,9 @@ def observe(
 ) -> Observation:
     """Return the observation of one vehicle, or of n.
 
-    Args:
-        image: As `Observation.image`.
-        intrinsics: The camera.
-        state: Telemetry.
-        goal: (..., 2) north, east [m], or (..., 3): down as well, where it has a height.
-        in_flight: What is known of the decisions; None: nothing is.
-        earlier: What the decisions before saw, and the states they saw it in, the newest first.
-        further: What further cameras show, by name; None: there are none.
+    `goal` is (..., 2) north, east [m], or (..., 3) with down, `in_flight` what is known of the
+    decisions, `earlier` the images of the decisions before with the states they were taken in, the
+    newest first, `further` the views of further cameras by name.
     """
     roll, pitch, yaw = quats_to_euler(state.quaternion)
     to_goal = np.zeros_like(state.position)

@@ -304,7 +304,7 @@ def camera_mismatch(spec: ObservationSpec | SeenCamera, camera: Intrinsics) -> s
 def _apart_deg(spec: ObservationSpec | SeenCamera, camera: Intrinsics) -> float:
     """Return how far apart two lenses see, at most, what they have in one place of the image.
 
-    Their fields of view are the same; this is between the middle of the image and its edge [deg].
+    Their fields of view are the same. This is between the middle of the image and its edge [deg].
     """
     if spec.distortion == camera.distortion:
         return 0.0

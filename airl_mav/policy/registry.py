@@ -93,13 +93,9 @@ def policy_names() -> list[str]:
 def find_policy(name: str, *, trust: bool = False) -> PolicyInfo:
     """Return what is known of a policy: by name, by its folder's path, or by its Python class.
 
-    Args:
-        name: Of the policy.
-        trust: Whether the maker of its folder may run code on this machine.
-
-    Raises:
-        UsageError: There is no such policy (lists those that exist), its card does not fit it, or
-            names code without trust.
+    `trust` permits the maker of its folder to run code on this machine. Raises UsageError if there
+    is no such policy (lists those that exist), its card does not fit it, or names code without
+    trust.
     """
     if names_code(name):
         return PolicyInfo(name.rpartition(":")[2], _summary(name), program=name)

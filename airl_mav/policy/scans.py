@@ -96,16 +96,10 @@ def tilt_of(roll: Floats, pitch: Floats) -> Tilt:
 
 
 def level_scan(depth_mm: NDArray[np.uint16], rays: Rays, tilt: Tilt, bearings: int) -> Floats:
-    """Return the ranges of what is about as high as the cameras.
+    """Return the nearest horizontal ranges (n, bearings) [m] at about the height of the cameras.
 
-    Args:
-        depth_mm: (n, h, w) depth images [mm], 0 = no return.
-        rays: Where their pixels look.
-        tilt: Their attitudes.
-        bearings: How many the scan has, from the left edge of the field of view to the right.
-
-    Returns:
-        (n, bearings) nearest horizontal ranges [m]; infinite: nothing is there.
+    `depth_mm` are (n, h, w) images, 0 = no return. Bearings go from the left edge of the field of
+    view to the right; infinite: nothing is there.
     """
     sr, cr, sp, cp = (np.asarray(each)[:, None, None] for each in tilt)
     depth = depth_mm / MM_PER_M
@@ -128,17 +122,10 @@ def level_scan(depth_mm: NDArray[np.uint16], rays: Rays, tilt: Tilt, bearings: i
 
 
 def carried(scans: Floats, moved: Moved, fov_rad: float) -> Floats:
-    """Return earlier scans as they would be if nothing but the vehicles had moved.
+    """Return earlier scans (n, bearings) as if nothing but the vehicles had moved.
 
-    A return is as wide as its bearing was from where it was seen. What was hidden stays unknown.
-
-    Args:
-        scans: (n, bearings) ranges [m]; infinite: nothing.
-        moved: How the vehicles have moved since.
-        fov_rad: Field of view of the scans [rad].
-
-    Returns:
-        (n, bearings).
+    Ranges [m] are infinite where nothing is. A return is as wide as its bearing was from where it
+    was seen. Hidden places stay unknown.
     """
     bearings = scans.shape[1]
     step = fov_rad / bearings
@@ -172,16 +159,9 @@ NUMPY_SCANNING = Scanning(level_scan, carried)
 def scans_of(
     seen: Observation, frames: int, bearings: int, make: Scanning = NUMPY_SCANNING
 ) -> Floats:
-    """Return the scans of n vehicles, all as from where they are now.
+    """Return the scans (n, frames, bearings) of n vehicles, all from their present place [m].
 
-    Args:
-        seen: Depth images of n vehicles, and in what states they were seen.
-        frames: How many scans each: of this decision, and of those before.
-        bearings: How many each has.
-        make: What makes them.
-
-    Returns:
-        (n, frames, bearings) ranges [m], the newest first; infinite: nothing, or no frame yet.
+    The newest, of this decision, comes first; infinite: nothing, or no frame yet.
     """
     rays, now = rays_of(seen.intrinsics), seen.states[0]
     scans = np.full((len(seen.goal), frames, bearings), np.inf)

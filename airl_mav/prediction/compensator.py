@@ -2,7 +2,7 @@
 
 A decision that takes t2 acts on a vehicle that has flown on meanwhile. But what it flies on is
 known: the setpoints that were sent. So the state is carried forward by the vehicle's response to
-them, to the moment at which the decision is expected to act; and the depth images are reprojected
+them, to the moment at which the decision is expected to act. And the depth images are reprojected
 to where the camera will be then. The policy need not have been trained for it.
 
 The same code in the companion (n = 1) and in the batch twin (n at a time); numpy alone.
@@ -128,16 +128,11 @@ class Compensator:
         now_us: NDArray[np.int64],
         state: Kinematics,
     ) -> tuple[NDArray[np.uint16], Kinematics]:
-        """Return what is seen, and how the vehicles move, when their decisions will act.
+        """Return images and motion of the vehicles at the time when their decisions will act.
 
-        Call it once a decision: the images are kept.
-
-        Args:
-            who: (k,) the companions that decide; the rows of others mean nothing.
-            depth_mm: (n, h, w) newest images, 0 = no return.
-            age_us: (n,) how long ago they were taken.
-            now_us: (n,) when the decisions begin.
-            state: Telemetry of all n.
+        Call it once a decision: the images are kept. Only the rows `who` (k,) decide; `depth_mm`
+        (n, h, w) are the newest images, 0 = no return, taken `age_us` (n,) ago; `now_us` (n,) is
+        when the decisions begin.
         """
         roll, pitch, heading = quats_to_euler(state.quaternion)
         now = Motion(state.position, state.velocity, heading, self._heading_rate(now_us))
@@ -171,14 +166,10 @@ class Compensator:
         sent_us: NDArray[np.int64],
         stopped_us: NDArray[np.int64] | None = None,
     ) -> None:
-        """Take the setpoints that were sent.
+        """Take the setpoints (k, 4) forward, right, down [m/s], yaw rate [rad/s] that were sent.
 
-        Args:
-            who: (k,) the companions that sent one.
-            command: (k, 4) forward, right, down [m/s], yaw rate [rad/s].
-            t2_us: (k,) what the decisions took.
-            sent_us: (k,) when they were sent.
-            stopped_us: (k,) when each will be replaced by a stop if no other has come; None: never.
+        The decisions took `t2_us` (k,); `stopped_us` (k,) is when a stop replaces each if no other
+        has come, None: never.
         """
         self.memory.decided(who, command, t2_us)
         for array in (self._setpoint, self._answered_us):

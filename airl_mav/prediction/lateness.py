@@ -12,7 +12,7 @@ REMEMBERED = 32
 class ExpectedLatency:
     """The expected t2 of n companions: the mean of the newest that each has measured.
 
-    Before the first decision nothing is expected; the vehicle hovers then, and a still vehicle is
+    Before the first decision nothing is expected. The vehicle hovers then, and a still vehicle is
     where it was, however late. The mean flies better than a high quantile (docs/results.md): the
     vehicle is on average where it was thought to be.
     """

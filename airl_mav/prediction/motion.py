@@ -29,18 +29,13 @@ class Motion(NamedTuple):
 
 
 def flown_on(motion: Motion, command: Array, response: Response, seconds: Array) -> Motion:
-    """Return how the vehicles move after some time on one setpoint each.
+    """Return the motion of vehicles after (n,) seconds on one setpoint (n, 4) each.
 
     With the heading turning at the rate w from psi on, the horizontal velocity v as a complex
-    number (north + i east) follows T v' = c exp(i (psi + w t)) - v, whose solution is
-    A exp(i w t) + (v0 - A) exp(-t / T) with A = c exp(i psi) / (1 + i w T). While the turn itself
-    still builds up, psi is that of the turn it ends in.
-
-    Args:
-        motion: At the beginning.
-        command: (n, 4) forward, right, down [m/s], yaw rate [rad/s].
-        response: The vehicle's; its dead time is the caller's to reckon with.
-        seconds: (n,) how long; >= 0.
+    number (north + i east) follows T v' = c exp(i (psi + w t)) - v, whose solution is A exp(i w t)
+    + (v0 - A) exp(-t / T) with A = c exp(i psi) / (1 + i w T). While the turn itself still builds
+    up, psi is that of the turn it ends in. The setpoint is forward, right, down [m/s], yaw rate
+    [rad/s]. The response's dead time is left to the caller.
     """
     turn, lag, turn_lag = command[:, 3], response.velocity_time_s, response.yaw_rate_time_s
     fading, turn_fading = np.exp(-seconds / lag), np.exp(-seconds / turn_lag)
@@ -64,15 +59,10 @@ def flown_on(motion: Motion, command: Array, response: Response, seconds: Array)
 
 
 def leaning(motion: Motion, command: Array, response: Response) -> tuple[Array, Array]:
-    """Return the roll and pitch (n,) [rad] with which the vehicles fly on a setpoint.
+    """Return the roll and pitch (n,) [rad] with which the vehicles fly on a setpoint (n, 4).
 
     The thrust carries the weight and gives the acceleration and what the drag takes, so that it is
     along the sum of the three.
-
-    Args:
-        motion: How they move.
-        command: (n, 4) the setpoint that is in effect.
-        response: The vehicle's.
     """
     course = np.exp(-1j * motion.heading)
     velocity = (motion.velocity[:, 0] + 1j * motion.velocity[:, 1]) * course

@@ -212,12 +212,8 @@ def _with_samples(latency: Latency, folder: Path) -> Latency:
 def read_samples(path: Path, option: str) -> tuple[float, ...]:
     """Read a text file of measured latencies in their order: one a line in ms, # for remarks.
 
-    Args:
-        path: The file.
-        option: The option or field that names it, for messages.
-
-    Raises:
-        UsageError: It cannot be read, is empty, or holds anything but latencies in (0, 60000] ms.
+    `option` names the file in messages. Raises UsageError if it cannot be read, is empty, or holds
+    anything but latencies in (0, 60000] ms.
     """
     try:
         lines = path.read_text(encoding="utf-8").splitlines()

@@ -18,15 +18,9 @@ def loaded(
     Computer and payload are points of mass, the computer in the middle of the rotors. Mass, centre
     of mass and inertia about it follow (parallel axes). Left out: products of inertia, and how far
     below the rotors the centre of mass comes to lie, which no force here acts on. Collision body,
-    drag and camera stay where they were against the centre of mass.
-
-    Args:
-        vehicle: As its profile has it.
-        computer: What flies along, unless it is ground equipment; None: no computer.
-        payload: The payload.
-
-    Raises:
-        FieldError: The rotors do not carry it with a margin, or not so far off their middle.
+    drag and camera stay where they were against the centre of mass. Ground equipment does not fly
+    along. Raises FieldError if the rotors do not carry it with a margin, or not so far off their
+    middle.
     """
     board_kg = 0.0 if computer is None else computer.onboard_mass_kg
     load_kg = payload.mass_g / G_PER_KG

@@ -75,7 +75,7 @@ def load_published(name: str = "air-learning") -> Published:
 def published_gap(reference: PublishedRun, target: PublishedRun) -> PublishedGap:
     """Work out the differences of two published columns by our own definition, signed.
 
-    They are in percent of the reference; success in percentage points, 0 where it is not given.
+    They are in percent of the reference. Success in percentage points, 0 where it is not given.
     """
 
     def percent(key: str) -> float:

@@ -108,9 +108,7 @@ def check_plant(asked: Aircraft) -> None:
 def check_ports(ports: Ports, *, any_camera: bool) -> None:
     """Raise FieldError for a port that no client could be told, or two links on one port.
 
-    Args:
-        ports: What was asked for.
-        any_camera: Whether the camera's port may be 0, any free one.
+    The camera's port may be 0, any free one, if `any_camera`.
     """
     for field in ("api_port", "gcs_port", *(() if any_camera else ("camera_port",))):
         if getattr(ports, field) == 0:
@@ -123,13 +121,7 @@ def check_ports(ports: Ports, *, any_camera: bool) -> None:
 
 
 def check_firmware(asked: Aircraft, level: LevelName, speed: float | str | None) -> None:
-    """Raise FieldError for real firmware that is asked for in a way that cannot be.
-
-    Args:
-        asked: What flies.
-        level: Rung of the fidelity ladder.
-        speed: Simulated seconds per wall second; None: as usual.
-    """
+    """Raise FieldError for options that real firmware does not support; None: default speed."""
     firmware, real = asked.firmware, asked.real
     if asked.signing_key is not None and (level != "sitl" or firmware != "builtin"):
         accepted = "at level sitl, with firmware builtin"

@@ -93,12 +93,9 @@ class WatchdogSettings(ProfileModel):
         hold_s: float = 0.0,
         on_card: float | None = None,
     ) -> float:
-        """Return the time-out of a decision [s]: as asked for, as on the card, or by default.
+        """Return the time-out of a decision [s]: as configured, as on the card, or by default.
 
-        Args:
-            commands: What the policy commands.
-            hold_s: How long each of its actions is held [s].
-            on_card: What the policy's card says [s]; None: nothing.
+        Actions are held for `hold_s`.
         """
         if self.decision_timeout_s is not None:
             return self.decision_timeout_s

@@ -238,12 +238,10 @@ class ResolvedScenario:
         return Path(self.scenario.arena).stem
 
     def latency_sampler(self, seed: int, *, native: bool) -> LatencySampler | None:
-        """Return where the episode of a seed draws t2 from.
+        """Return the source of t2 of a seed's episode.
 
-        Args:
-            seed: Of the episode.
-            native: Whether the companion's own time counts: then None means that nothing is
-                injected; otherwise t2 is that of a desktop computer.
+        Where the companion's own time counts (`native`), None means that nothing is injected.
+        Otherwise t2 is that of a desktop computer.
         """
         sampler = self.injection.sampler(latency_generator(seed, self.scenario.latency_seed))
         return sampler if native else sampler or FixedSampler(NATIVE_T2_US)

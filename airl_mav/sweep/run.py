@@ -159,21 +159,10 @@ def run_sweep(
 ) -> tuple[Sweep, str | None]:
     """Run the remaining trials; `sweep.json` is written after each.
 
-    Args:
-        path: The sweep's folder, new or to resume; all workers see it under this path.
-        config: The search space.
-        executor: Executor of the trainings.
-        command: The command line, for the records.
-        progress: Progress display.
-        device: cpu or cuda.
-        computer: Computer for latency estimates; None = none.
-        stop: Polled several times a second; True stops the sweep and keeps finished trials.
-
-    Returns:
-        The sweep so far, and the reason of an early end or None.
-
-    Raises:
-        UsageError: Invalid input, or the folder holds something else.
+    All workers see the folder, new or to resume, under this path. `stop` is polled several times a
+    second; True stops the sweep and keeps finished trials. Returns the sweep so far, and the reason
+    of an early end or None. Raises UsageError for invalid input, or if the folder holds something
+    else.
     """
     say = partial(progress.note, style="yellow")
     with open_campaign(path, declaration(config), command=command, say=say) as store:

@@ -258,18 +258,9 @@ def configured(
 ) -> TrainingConfig:
     """Return a configuration with some of its values changed.
 
-    Args:
-        config: Default values.
-        seed: Seed of weights, exploration and episodes.
-        steps: Decisions of all vehicles together.
-        computer: Profile whose latency applies; needs `workload`.
-        workload: Workload whose t2 is drawn in every decision.
-        latency: Sources of t2 instead of computer and workload.
-        sensing_distance_m: Sensing distance of the safe velocity [m].
-        initial: Training run whose best weights are the initial ones.
-
-    Raises:
-        UsageError: A value is out of range, or needs another one.
+    `steps` are decisions of all vehicles together, `computer` is the profile of whose `workload` t2
+    is drawn, `latency` names sources of t2 instead, `initial` is the training run with the initial
+    weights. Raises UsageError if a value is out of range, or needs another one.
     """
     if computer is not None and workload is None:
         known = ", ".join(load_computer(computer).workloads)

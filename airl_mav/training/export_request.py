@@ -262,14 +262,9 @@ class ExportRequest(BaseModel):
         return names_code(self.model)
 
     def facts(self, command: str, taken: Taken | None = None) -> PolicyFacts:
-        """Return the card data.
+        """Return the card data; `taken` is that from the loaded model, `command` the command line.
 
-        Args:
-            command: Command line of the export.
-            taken: Data from the loaded model.
-
-        Raises:
-            UsageError: A field is missing, contradicts another or is out of range.
+        Raises UsageError if a field is missing, contradicts another or is out of range.
         """
         if self.algorithm is None and not self.own_module:
             raise FieldError("algorithm", accepted="the class that wrote the .zip: DQN, PPO, ...")

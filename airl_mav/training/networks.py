@@ -1,6 +1,6 @@
 """Networks from their specification, as stable-baselines3 takes them.
 
-The extractor holds the convolutions and joins their output with velocity and goal; the dense layers
+The extractor holds the convolutions and joins their output with velocity and goal. The dense layers
 are the policy's `net_arch`, so that every algorithm builds its own heads on it.
 """
 
@@ -19,7 +19,7 @@ from airl_mav.policy.layouts import GOAL, IN_FLIGHT, VELOCITY, image_key
 from airl_mav.training.config import NetworkSpec
 
 VECTORS = (VELOCITY, GOAL, IN_FLIGHT)
-"""Inputs that join the convolutions, in this order and before any others; not every layout has
+"""Inputs that join the convolutions, in this order and before any others. Not every layout has
 all."""
 
 OWN_DENSE = (128, 128)

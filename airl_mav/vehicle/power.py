@@ -1,7 +1,7 @@
 """Electrical power of the aircraft: momentum theory from the rotor's own data, or a regression.
 
 One kernel for plant and batch twin. Both models give the aircraft's own power, its flight
-controller included; the onboard computer's watts come beside it.
+controller included. The onboard computer's watts come beside it.
 """
 
 from __future__ import annotations
@@ -109,10 +109,8 @@ def induced_velocity(ideal2: float, in_plane2: float, climb: float) -> float:
     with the three velocities at right angles to each other. Exact in a hover, and to 4e-4 up to a
     climb of two and an advance of five times v_h, which leaves 2e-4 of the power.
 
-    Args:
-        ideal2: v_h², the square of the induced velocity in a hover, T / (2 rho A), > 0 [m²/s²].
-        in_plane2: Square of the velocity in the plane of the discs against the air [m²/s²].
-        climb: V_c, velocity against the air along the thrust, >= 0 [m/s].
+    `ideal2` is v_h² = T / (2 rho A) > 0, of a hover, `in_plane2` the square of the velocity in the
+    plane of the discs against the air [m²/s²], `climb` V_c, that along the thrust, >= 0 [m/s].
     """
     v = ideal2 / math.sqrt(in_plane2 + climb * climb + ideal2)
     # Of f(v) = v sqrt(V_inplane² + (V_c + v)²) - v_h²: f, f' and f'', each times the root.
@@ -140,7 +138,7 @@ def momentum_power_w(
 
     Args:
         thrust: T, of all rotors [N].
-        thrust_max: Of one rotor at full command [N]; its speed follows from it.
+        thrust_max: Of one rotor at full command [N]. Its speed follows from it.
         in_plane2: Square of the velocity in the plane of the discs against the air [m²/s²].
         climb: V_c, velocity against the air along the thrust [m/s].
         m: The model.
@@ -160,14 +158,9 @@ def momentum_power_w(
 def regression_power_w(velocity: Vec, acceleration: Vec, wind: Vec, m: PowerModel) -> float:
     """Return the power by the nine coefficients [W], never below 0.
 
-    P = b1 |vxy| + b2 |axy| + b3 |vxy||axy| + b4 |vz| + b5 |az| + b6 |vz||az| + b7 m
-    + b8 vxy.w + b9 (Krishnan et al. 2021, eq. 1, after Tseng et al., arXiv 1703.10049).
-
-    Args:
-        velocity: NED [m/s].
-        acceleration: NED, gravity removed, low-passed as `felt` does it [m/s²].
-        wind: NED [m/s].
-        m: The model.
+    P = b1 |vxy| + b2 |axy| + b3 |vxy||axy| + b4 |vz| + b5 |az| + b6 |vz||az| + b7 m + b8 vxy.w + b9
+    (Krishnan et al. 2021, eq. 1, after Tseng et al., arXiv 1703.10049). All vectors are NED; the
+    acceleration is without gravity, low-passed by `felt`.
     """
     vxy = math.sqrt(velocity[0] * velocity[0] + velocity[1] * velocity[1])
     axy = math.sqrt(acceleration[0] * acceleration[0] + acceleration[1] * acceleration[1])
@@ -190,13 +183,9 @@ def felt_share(m: PowerModel, dt: float) -> float:
 def felt(before: Vec, velocity: Vec, newer: Vec, kept: float, dt: float, m: PowerModel) -> Vec:
     """Return the acceleration that a regression goes by: a first-order low-pass, NED [m/s²].
 
-    Args:
-        before: What it was before the tick [m/s²].
-        velocity: Before the tick, NED [m/s].
-        newer: After it.
-        kept: `felt_share`: the same at every tick.
-        dt: Length of the tick [s].
-        m: The model; momentum theory needs no acceleration, and `before` comes back.
+    `before` is its value before the tick of dt [s], `velocity` and `newer` are the velocities
+    before and after it, `kept` is `felt_share`. Momentum theory needs no acceleration, and `before`
+    comes back.
     """
     if m.momentum != 0.0:
         return before
@@ -220,16 +209,8 @@ def flight_power_w(
 ) -> float:
     """Return the power over a tick of flight [W], without the onboard computer's.
 
-    Velocity, attitude and acceleration are those at the start of the tick, in which its forces act.
-
-    Args:
-        thrust: Of all rotors [N].
-        velocity: NED [m/s].
-        q: Attitude body -> NED.
-        wind: NED [m/s].
-        acceleration: As `felt` returns it, NED [m/s²].
-        airframe: The vehicle.
-        m: Its power model.
+    Velocity, attitude (body -> NED) and acceleration (by `felt`) are those at the start of the
+    tick, in which its forces act; `thrust` is that of all rotors [N].
     """
     if m.momentum == 0.0:
         return regression_power_w(velocity, acceleration, wind, m)

@@ -64,7 +64,7 @@ def _px4(wanted: Wanted) -> tuple[Launcher, Endpoint]:
 def px4_parts(
     wanted: Wanted, instance: int, bridge: Callable[[int], Px4Bridge]
 ) -> tuple[Launcher, Endpoint]:
-    """Bind the observer's end of PX4's payload link; return PX4's launcher and that end.
+    """Bind the observer's end of PX4's payload link. Return PX4's launcher and that end.
 
     `instance` moves the ports; `bridge` opens the simulator interface on one.
     """

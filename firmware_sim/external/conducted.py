@@ -1,6 +1,6 @@
 """PX4 SITL for a conducted companion: the companion's link, and its own instance.
 
-Only PX4's boot runs by the wall clock; a busy host slows a flight down but never ends it.
+Only PX4's boot runs by the wall clock. A busy host slows a flight down but never ends it.
 """
 
 from __future__ import annotations

@@ -161,10 +161,8 @@ class WorkingFolders:
     def __init__(self, name: str, kept: Path | None, log: Path | None) -> None:
         """Choose the folders of a firmware, such as px4.
 
-        Args:
-            name: Name of the firmware.
-            kept: Folder that keeps the working folders; None = temporary ones, one at a time.
-            log: Log of its output; None = a file beside the working folders.
+        `kept` keeps the working folders, None = temporary ones, one at a time; `log` holds its
+        output, None = a file beside the working folders.
         """
         self._name = name
         self._flights = 0

@@ -29,13 +29,10 @@ class FailingParts:
         vehicle: VehicleProfile,
         timeline: FaultTimeline,
     ) -> None:
-        """Put it in between; nothing fails yet.
+        """Put it between controller and plant; nothing fails yet.
 
-        Args:
-            controller: Who flies.
-            plant: What is flown: gusts are added to its wind, and its charge drops.
-            vehicle: Its profile: noise of the sensors, the battery, the motors' curve.
-            timeline: The faults of the episode.
+        Gusts are added to the plant's wind, and its charge drops. The profile has the noise of the
+        sensors, the battery, and the motors' curve.
         """
         self._controller = controller
         self._plant = plant

@@ -164,13 +164,9 @@ class FailingEndpoint(FailingSender):
     def __init__(self, endpoint: SharedEndpoint, clock: Clock, *, conducted: bool = False) -> None:
         """Take the healthy endpoint and simulated time.
 
-        Args:
-            endpoint: What it lies around.
-            clock: Simulated time.
-            conducted: Whether a companion in lockstep is at the other end. A command and its answer
-                are one moment of simulated time then: only a cut stops them, all other faults act
-                on setpoints and telemetry. Frames arrive with a tick, so that the flight is the
-                same every time.
+        If `conducted`, a companion in lockstep is at the other end. A command and its answer are
+        one moment of simulated time then: only a cut stops them, all other faults act on setpoints
+        and telemetry. Frames arrive with a tick, so that the flight is the same every time.
         """
         super().__init__(endpoint, clock, conducted=conducted)
         self._shared = endpoint

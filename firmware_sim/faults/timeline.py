@@ -59,13 +59,7 @@ class FaultTimeline:
     """The faults of one episode. Asked once a tick; everything else only when something changes."""
 
     def __init__(self, faults: Sequence[Fault], seed: int, start_us: int) -> None:
-        """Begin an episode.
-
-        Args:
-            faults: What was asked for.
-            seed: Of the episode.
-            start_us: When it begins [µs].
-        """
+        """Begin an episode with these faults at `start_us`."""
         self._faults = list(faults)
         self._seed = seed
         self._entered: dict[str, int] = {}

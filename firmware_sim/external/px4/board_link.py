@@ -193,12 +193,10 @@ class BoardLink:
     # --- connecting
 
     def connect(self, timeout_s: float, alive: Callable[[], None], *, returning: bool) -> None:
-        """Return once a board in HIL mode has sent a heartbeat.
+        """Return once a board in HIL mode has sent a heartbeat, at most after `timeout_s` [wall s].
 
-        Args:
-            timeout_s: Timeout [wall s].
-            alive: Called at intervals; raises to give up.
-            returning: Whether the device was there before and may be absent at first.
+        `alive` is called at intervals and raises to give up. If `returning`, the device was there
+        before and may be absent at first.
 
         Raises:
             UsageError: The device cannot be opened.

@@ -1,6 +1,6 @@
 """Hardware in the loop: a PX4 board that flies on simulated sensors over a serial or USB line.
 
-There is no lockstep. The board runs on its own clock; every tick's sensors are sent to it, and its
+There is no lockstep. The board runs on its own clock. Every tick's sensors are sent to it, and its
 newest motor commands are applied, late by a transfer and a cycle of the board.
 
 Source: PX4, src/modules/mavlink: mavlink_receiver.cpp (HIL_SENSOR, HIL_GPS),

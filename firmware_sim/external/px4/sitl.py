@@ -29,7 +29,7 @@ STOPPED_S = 1.0
 clients miss its heartbeats."""
 
 REST_S = 0.1
-"""Longest wait for one answer of a PX4 that is disarmed [wall s]; then the next sample is sent. In
+"""Longest wait for one answer of a PX4 that is disarmed [wall s]. Then the next sample is sent. In
 Offboard on the ground, without a setpoint, it answers only now and then, by its own clock, which
 does not advance while it is waited for."""
 
@@ -76,13 +76,10 @@ class Px4Bridge:
         start_s: float = START_S,
         least_state_us: int = 1,
     ) -> None:
-        """Listen for PX4, or raise UsageError.
+        """Listen for PX4 on TCP port 4560 + instance, 0 = any free one, or raise UsageError.
 
-        Args:
-            port: TCP port: 4560 + instance, 0 = any free one.
-            answer_s: Timeout of an answer [wall s].
-            start_s: Timeout of the first one [wall s].
-            least_state_us: Minimum interval of the true state [µs].
+        `answer_s` and `start_s` are the timeouts of an answer and of the first one [wall s],
+        `least_state_us` the minimum interval of the true state.
         """
         self._least_state_us = least_state_us
         self.armed = False
@@ -133,7 +130,7 @@ class Px4Bridge:
     def settle(self) -> None:
         """Return once PX4 has done all that is due by its clock, as far as that can be seen.
 
-        Controllers and estimator are done when it answers a sample; other threads may lag on a busy
+        Controllers and estimator are done when it answers a sample. Other threads may lag on a busy
         host.
         """
         if self._program is not None and self._answer is not None:
