@@ -42,7 +42,7 @@ from airl_mav.camera.rays import rays_of
 from airl_mav.camera.render import render
 from airl_mav.camera.textures import atlas
 from airl_mav.core.frames import quat_to_matrix
-from airl_mav.profiles.mesh_file import MeshFile
+from airl_mav.profiles.asset_files import MeshFile
 
 THINGS = 10
 ROUNDS = 15

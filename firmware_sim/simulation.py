@@ -18,8 +18,7 @@ from airl_mav.core.constants import TICK_US
 from airl_mav.core.streams import Stream, stream
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import Aircraft
-from airl_mav.vehicle.airframe import Airframe
-from airl_mav.vehicle.spread import draw_airframe
+from airl_mav.vehicle.airframe import Airframe, draw_airframe
 from airl_mav.vehicle.wind import wind_of_episode
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.parameter_store import Keeper, Parameters

@@ -19,7 +19,7 @@ from airl_mav.profiles.appearance import (
     Surfaces,
     TextureName,
 )
-from airl_mav.profiles.image_file import ImageFile
+from airl_mav.profiles.asset_files import ImageFile
 
 Floats = NDArray[np.float64]
 Rgb = tuple[int, int, int]

@@ -1,9 +1,9 @@
 """A bounding volume hierarchy over the triangles of a mesh, built once for each mesh.
 
 A binary tree of boxes along the mesh's axes (Wald, On fast construction of SAH-based bounding
-volume hierarchies, 2007): each split is the one of least expected cost of a ray, by the surface
-areas of both sides, among `BINS` places along each axis. The tree lies in flat arrays, depth first:
-the left child of an inner node is the next node.
+volume hierarchies, 2007). Each split is the one of least expected cost of a ray, by the surface
+areas of both sides, among `BINS` places along each axis. The tree lies in flat arrays, depth first.
+The left child of an inner node is the next node.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from airl_mav.arena.triangles import KEPT, Triangles, triangles_of
 from airl_mav.camera.primitives import GROUND, OBSTACLE
 from airl_mav.camera.projection import MIN_DEPTH_M
 from airl_mav.core.kernels import borrowing_kernel, large_kernel
-from airl_mav.profiles.mesh_file import MeshFile
+from airl_mav.profiles.asset_files import MeshFile
 from airl_mav.vehicle.rotation import Vec
 
 BINS: Final = 16

@@ -128,7 +128,8 @@ def render_colour(
         return
     invert(far)
     pixel2 = F32(1.0 / (view.focal * view.focal))
-    look = Look(texture, per_m, offset, albedo, gloss, _lit(lights), atlas, pixel2)
+    light = _lit(lights)
+    look = Look(texture, per_m, offset, albedo, gloss, light, atlas, pixel2)  # type: ignore[arg-type]
     _show(rgb, far, ids, rectangles, faces, work, optics, scene, meshes, look, gloss)
     if cylindrical:
         depth[:, :] = far.T

@@ -1,7 +1,7 @@
 """How a colour camera's image is formed: exposed while the vehicle moves, metered, noisy, coded.
 
 An exposure that takes time is the mean of images of shorter ones, from where vehicle and obstacles
-are then: its middle is the frame's stamp, and velocity and angular rates are those of that moment.
+are then. Its middle is the frame's stamp, and velocity and angular rates are those of that moment.
 With a rolling shutter the rows are exposed one after the other, the first at the top, and the stamp
 is the middle of the middle row's exposure.
 A gain is light: the scene is drawn with all light times the gain, so that dark ones keep their

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from airl_mav.profiles.camera_kind import CameraKind, shape_of
+from airl_mav.profiles.camera_kind import CameraKind, Projection, shape_of
 from airl_mav.profiles.distortion import UNDISTORTED, Distortion, distorted, sees_to, undistorted
-from airl_mav.profiles.projection import Projection
 
 if TYPE_CHECKING:  # A frame source needs no models of profiles.
     from airl_mav.profiles.camera import Camera

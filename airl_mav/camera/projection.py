@@ -1,6 +1,6 @@
 """Where a body falls in the image: the pixels that bound its projection.
 
-An image is made of lines: a pinhole's are its rows, a cylinder's its columns. Along each of them a
+An image is made of lines. A pinhole's are its rows, a cylinder's its columns. Along each of them a
 pixel's ray is start + x along, affine in x, so that both are drawn by the same loops.
 """
 

@@ -241,7 +241,7 @@ def render_depth(
         out: (height, width) depth [m], written; 0 = no return. Along the optical axis of a pinhole,
             in the camera's horizontal plane of a cylinder, along the ray of a fisheye.
         position: (3,) camera NED [m].
-        quaternion: (4,) unit [w, x, y, z] camera -> NED: its x axis is the optical axis, y points
+        quaternion: (4,) unit [w, x, y, z] camera -> NED. Its x axis is the optical axis, y points
             to the right of the image, z to its bottom.
         focal: Focal length [px] of a pinhole, columns for an angle [px/rad] of a cylinder.
         cx: Column of the optical axis; pixel centres are at whole numbers.

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from airl_mav.arena.appearance import FLOOR as FLOOR_ROW
 from airl_mav.arena.appearance import OBSTACLE as OBSTACLE_ROW
 from airl_mav.arena.appearance import WALLS as WALLS_ROW
-from airl_mav.camera import gloss, patterns, shading
+from airl_mav.camera import gloss, shading
 from airl_mav.camera.bvh import STACK, Meshes
 from airl_mav.camera.primitives import (
     BOX,
@@ -323,7 +323,7 @@ def albedo_at(
     if met.mesh >= 0:
         if meshes is not None:
             n = meshes.bvh.normals[met.face]
-            across, along = patterns.on_triangle(a, b, c, n[0], n[1], n[2])
+            across, along = shading.on_triangle(a, b, c, n[0], n[1], n[2])
     elif met.seen == FLOOR:
         across, along = b, -a
     elif met.seen < OBSTACLE:
@@ -334,17 +334,17 @@ def albedo_at(
             bodies.half_size[met.seen - OBSTACLE, 0],
         )
         if shape == BOX:
-            across, along = patterns.on_box(a, b, c, place.side == 2, place.side == 0)
+            across, along = shading.on_box(a, b, c, place.side == 2, place.side == 0)
         else:
-            per_turn, in_periods = patterns.periods_around(radius, per_m), True
+            per_turn, in_periods = shading.periods_around(radius, per_m), True
             if shape == CYLINDER:
-                across, along = patterns.on_cylinder(a, b, c, place.side == 2, per_m, per_turn)
+                across, along = shading.on_cylinder(a, b, c, place.side == 2, per_m, per_turn)
             else:
-                across, along = patterns.on_sphere(a, b, c, per_turn)
+                across, along = shading.on_sphere(a, b, c, per_turn)
     if not in_periods:
         across, along = across * per_m, along * per_m
-    steep = max(shading.F32(-dot(place.normal, ray)), patterns.STEEP)
-    texels = patterns.texels2(surface, pixel2) * shading.F32(way) * shading.F32(way) / steep
+    steep = max(shading.F32(-dot(place.normal, ray)), shading.STEEP)
+    texels = shading.texels2(surface, pixel2) * shading.F32(way) * shading.F32(way) / steep
     at = shading.texel_at(across + surface.offset[0], along + surface.offset[1], texels)
     red = look.atlas[np.uint64(surface.base + at)]
     green, blue = red, red

@@ -17,8 +17,7 @@ from airl_mav.arena.appearance import OBSTACLE as OBSTACLE_ROW
 from airl_mav.arena.appearance import WALLS as WALLS_ROW
 from airl_mav.camera import primitives
 from airl_mav.camera.bvh import Meshes, is_owned, material_row
-from airl_mav.camera.mesh_rays import distance_to, stopped_by
-from airl_mav.camera.meshes import inverse_of
+from airl_mav.camera.meshes import distance_to, inverse_of, stopped_by
 from airl_mav.camera.projection import Scene, dot
 from airl_mav.core.kernels import borrowing_kernel, kernel, large_borrowing_kernel
 from airl_mav.vehicle.rotation import Vec

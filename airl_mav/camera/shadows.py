@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 
 from airl_mav.camera.bvh import STACK, Meshes, material_row
 from airl_mav.camera.gloss import Gloss, let_through
-from airl_mav.camera.mesh_rays import stopped_by
 from airl_mav.camera.mesh_triangles import Faces
-from airl_mav.camera.meshes import inverse_of, seen_from
+from airl_mav.camera.meshes import inverse_of, seen_from, stopped_by
 from airl_mav.camera.primitives import BOX, CYLINDER, OBSTACLE, SKY, Ids, turned
 from airl_mav.camera.projection import (
     Bent,

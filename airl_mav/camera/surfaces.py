@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from airl_mav.arena.appearance import FLOOR as FLOOR_ROW
 from airl_mav.arena.appearance import OBSTACLE as OBSTACLE_ROW
 from airl_mav.arena.appearance import WALLS as WALLS_ROW
-from airl_mav.camera import patterns, primitives
+from airl_mav.camera import primitives, shading
 from airl_mav.camera.bvh import Meshes, material_row
 from airl_mav.camera.mesh_triangles import Faces
 from airl_mav.camera.projection import MIN_DEPTH_M, Body, Optics, Pose
@@ -125,7 +125,7 @@ def shade_floor(canvas: Canvas, look: Look, camera: Vec) -> None:
     at0, at1 = F32(camera[0]), F32(camera[1])
     sun_up = -light.to_sun[2]
     # The camera's height is t times the ray's slope.
-    texel = patterns.texels2(floor, pixel2) / F32(max(-camera[2], MIN_DEPTH_M))
+    texel = shading.texels2(floor, pixel2) / F32(max(-camera[2], MIN_DEPTH_M))
     own = I32(primitives.FLOOR)
     begin, stop = span_of(ids, 0, len(ids), 0, len(ids), own, own)
     for left in range(begin, stop, BLOCK):
@@ -148,7 +148,7 @@ def shade_walls(canvas: Canvas, look: Look, camera: Vec) -> None:
     ids, far, light, pixel2 = canvas.ids, canvas.far, look.light, look.pixel2
     at0, at1, at2 = F32(camera[0]), F32(camera[1]), F32(camera[2])
     sun0, sun1 = light.to_sun[0], light.to_sun[1]
-    texel = patterns.texels2(walls, pixel2)
+    texel = shading.texels2(walls, pixel2)
     first, last = I32(primitives.WALL_NORTH_SOUTH), I32(primitives.WALL_EAST_WEST)
     begin, stop = span_of(ids, 0, len(ids), 0, len(ids), first, last)
     for left in range(begin, stop, BLOCK):
@@ -162,7 +162,7 @@ def shade_walls(canvas: Canvas, look: Look, camera: Vec) -> None:
             to_sun = -to_sun if normal > ZERO else to_sun
             across = (at1 + t * e if north else at0 + t * n) * walls.per_m + walls.offset[0]
             along = (at2 + t * d) * walls.per_m + walls.offset[1]
-            texels = texel * t * t / max(abs(normal), patterns.STEEP)
+            texels = texel * t * t / max(abs(normal), shading.STEEP)
             points.place[u] = texel_at(across, along, texels)
             points.facing[u] = max(to_sun, ZERO)
             points.up[u] = ZERO
@@ -189,9 +189,9 @@ def shade_obstacle(
     s1 = F32(cos * light.to_sun[1] - sin * light.to_sun[0])
     s2 = light.to_sun[2]
     per0, per1, per2 = F32(1.0 / half[0]), F32(1.0 / half[1]), F32(1.0 / half[2])
-    texel, radius = patterns.texels2(surface, look.pixel2), F32(half[0])
+    texel, radius = shading.texels2(surface, look.pixel2), F32(half[0])
     per_m, begin_u, begin_v = surface.per_m, surface.offset[0], surface.offset[1]
-    per_turn = patterns.periods_around(half[0], per_m)
+    per_turn = shading.periods_around(half[0], per_m)
     place, facing, ups = points.place, points.facing, points.up
     own = I32(primitives.OBSTACLE + body.number)
     for v in range(rectangle[0], rectangle[1]):
@@ -215,8 +215,8 @@ def shade_obstacle(
                 to_sun = s2 if on_c else (s0 if on_a else s1)
                 to_sun = to_sun if outward > ZERO else -to_sun
                 up = ONE if c < ZERO else -ONE
-                across, along = patterns.on_box(a, b, c, on_c, on_a)
-                texels = texel * t * t / max(abs(normal), patterns.STEEP)
+                across, along = shading.on_box(a, b, c, on_c, on_a)
+                texels = texel * t * t / max(abs(normal), shading.STEEP)
                 place[u] = texel_at(across * per_m + begin_u, along * per_m + begin_v, texels)
                 facing[u] = max(to_sun, ZERO)
                 ups[u] = up if on_c else ZERO
@@ -230,8 +230,8 @@ def shade_obstacle(
                 vertical = s2 if c > ZERO else -s2
                 to_sun = vertical if cap else (a * s0 + b * s1) * per0
                 up = ONE if c < ZERO else -ONE
-                across, along = patterns.on_cylinder(a, b, c, cap, per_m, per_turn)
-                texels = texel * t * t / max(abs(normal), patterns.STEEP)
+                across, along = shading.on_cylinder(a, b, c, cap, per_m, per_turn)
+                texels = texel * t * t / max(abs(normal), shading.STEEP)
                 place[u] = texel_at(across + begin_u, along + begin_v, texels)
                 facing[u] = max(to_sun, ZERO)
                 ups[u] = up if cap else ZERO
@@ -242,8 +242,8 @@ def shade_obstacle(
                 a, b, c = t * n - c0, t * e - c1, t * d - c2
                 normal = (a * n + b * e + c * d) * per0
                 to_sun = (a * s0 + b * s1 + c * s2) * per0
-                across, along = patterns.on_sphere(a, b, c, per_turn)
-                texels = texel * t * t / max(abs(normal), patterns.STEEP)
+                across, along = shading.on_sphere(a, b, c, per_turn)
+                texels = texel * t * t / max(abs(normal), shading.STEEP)
                 place[u] = texel_at(across + begin_u, along + begin_v, texels)
                 facing[u] = max(to_sun, ZERO)
                 ups[u] = min(max(-c * per0, -ONE), ONE)
@@ -294,7 +294,7 @@ def _shade_mesh(
     s0 = F32(cos * light.to_sun[0] + sin * light.to_sun[1])
     s1 = F32(cos * light.to_sun[1] - sin * light.to_sun[0])
     s2 = light.to_sun[2]
-    texel, per_m = patterns.texels2(surface, look.pixel2), surface.per_m
+    texel, per_m = shading.texels2(surface, look.pixel2), surface.per_m
     begin_u, begin_v = surface.offset[0], surface.offset[1]
     normals = meshes.bvh.normals
     own = I32(primitives.OBSTACLE + meshes.first[k])
@@ -318,8 +318,8 @@ def _shade_mesh(
             # The side that is seen faces the camera.
             side = -ONE if normal > ZERO else ONE
             a, b, c = t * n - c0, t * e - c1, t * d - c2
-            across, along = patterns.on_triangle(a, b, c, n0, n1, n2)
-            texels = texel * t * t / max(abs(normal), patterns.STEEP)
+            across, along = shading.on_triangle(a, b, c, n0, n1, n2)
+            texels = texel * t * t / max(abs(normal), shading.STEEP)
             points.place[u] = texel_at(across * per_m + begin_u, along * per_m + begin_v, texels)
             points.facing[u] = max(side * (n0 * s0 + n1 * s1 + n2 * s2), ZERO)
             points.up[u] = -side * n2

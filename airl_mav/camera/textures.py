@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.appearance import TEXTURES, Finish, image_number, linear_of
 from airl_mav.core.errors import UsageError
-from airl_mav.profiles.image_file import MOST_IMAGES, ImageFile
-from airl_mav.profiles.mesh_file import read_checked
+from airl_mav.profiles.asset_files import MOST_IMAGES, ImageFile, read_checked
 
 Floats = NDArray[np.float64]
 

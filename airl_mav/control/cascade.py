@@ -13,10 +13,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from airl_mav.control.attitude import attitude_setpoint, heading_of, rate_setpoint
+from airl_mav.control.attitude import attitude_setpoint, heading_of, rate_control, rate_setpoint
 from airl_mav.control.demand import AttitudeDemand, Demand, RateDemand, TrajectoryDemand
 from airl_mav.control.gains import Gains
-from airl_mav.control.low_pass import Biquad, butterworth, filtered, weight
 from airl_mav.control.memory import (
     ATTITUDE_SP,
     DGYRO,
@@ -36,12 +35,15 @@ from airl_mav.control.memory import (
     WAIT,
     YAW_RATE_SP,
     YAW_TORQUE,
+    Biquad,
     Memory,
+    butterworth,
+    filtered,
     settle_gyro_filter,
     three,
+    weight,
 )
 from airl_mav.control.mixer import Motors, mix
-from airl_mav.control.rate import rate_control
 from airl_mav.control.velocity import (
     acceleration_control,
     velocity_control,

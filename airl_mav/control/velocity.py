@@ -60,7 +60,7 @@ def velocity_setpoint(position: Vec, position_sp: Vec, velocity_ff: Vec, gains: 
 def thrust_from_acceleration(acc: Vec, gains: Gains) -> Vec:
     """Return the thrust vector NED (normalised, hover = hover_thrust) for an acceleration [m/s²].
 
-    Horizontal and vertical acceleration are decoupled (MPC_ACC_DECOUPLE = 1): the tilt follows
+    Horizontal and vertical acceleration are decoupled (MPC_ACC_DECOUPLE = 1). The tilt follows
     from the horizontal part alone, limited to tilt_max.
     """
     # body_z (down) points against the horizontal acceleration: (-ax, -ay, g), normalised

@@ -1,6 +1,6 @@
 """Where commands print: rich's console, without its markup.
 
-What is printed are paths, names and messages of others: brackets in them are brackets, not styles,
+What is printed are paths, names and messages of others. Brackets in them are brackets, not styles,
 and `:name:` is no emoji. Who wants a style gives it by name.
 """
 

@@ -112,7 +112,7 @@ def kernel(function: F) -> F:
     costs a third of the batch twin's speed. Never `parallel`: one thread a process, processes for
     parallelism.
 
-    A division by zero gives infinity or NaN, as numpy's, and no ZeroDivisionError: looking out for
+    A division by zero gives infinity or NaN, as numpy's, and no ZeroDivisionError. Looking out for
     one at every division takes a tenth of the twin's speed, and keeps the compiler from vector
     instructions.
 

@@ -2,7 +2,7 @@
 
 psutil reads what it knows; governor and throttling are read from where Linux and the Raspberry Pi's
 firmware offer them. None stands for what a system does not offer. psutil is imported where it is
-asked: the records of flights need this module, and whoever reads them asks nothing.
+asked. The records of flights need this module, and whoever reads them asks nothing.
 """
 
 from __future__ import annotations

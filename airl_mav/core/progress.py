@@ -1,6 +1,6 @@
 """Progress of long work: bars and lines on a terminal, or nothing for callers of the Python API.
 
-Whoever does the work is given a `Progress`: it opens a `Bar` for what can be counted, says what is
+Whoever does the work is given a `Progress`. It opens a `Bar` for what can be counted, says what is
 done meanwhile, notes what a person should read and tells what a program should know. `RichProgress`
 draws; `json_progress` writes for programs.
 """

@@ -24,7 +24,7 @@ from airl_mav.core.kernels import kernel
 from airl_mav.envs.arenas import ArenaBatch, copy_rows, move_obstacles, relief_of
 from airl_mav.envs.fleet import Fleet
 from airl_mav.envs.meshes import MeshBatch, MeshesSeen, meshes_in
-from airl_mav.profiles.image_file import ImageFile
+from airl_mav.profiles.asset_files import ImageFile
 
 
 class LookBatch(NamedTuple):

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from pydantic import Field, field_validator, model_validator
 
+from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import ProfileModel, quantity
-from airl_mav.faults.kinds import KINDS, LINKS, Kind, Part, Phase, kinds_of
-from airl_mav.faults.words import fault_text, read_fault
+from airl_mav.faults.kinds import KINDS, LINKS, Kind, Part, Phase, fault_text, kinds_of, read_fault
 
 LONGEST_S = 100_000.0
 
@@ -108,3 +108,37 @@ class Fault(ProfileModel):
 def link_fails(faults: Iterable[Fault]) -> bool:
     """Return whether any of these is a fault of the link between companion and firmware."""
     return any(fault.part in LINKS for fault in faults)
+
+
+# --- faults that the batch twin can fly; its flights begin where the policy takes over
+
+TWIN = "gym"
+"""The batch twin's rung of the fidelity ladder."""
+
+
+def check_twin(faults: Sequence[Fault], *, pipelined: bool = False) -> None:
+    """Raise FieldError for a fault that the twin cannot fly.
+
+    With pipelined decisions, delays beyond the next decision are not modelled.
+    """
+    for fault in faults:
+        levels = fault.about.levels
+        if TWIN not in levels:
+            raise FieldError("faults", str(fault), f"at level {' or '.join(levels)}")
+        if not _in_flight(fault):
+            raise FieldError("faults", str(fault), "at offboard, or offboard+TIME, at level gym")
+        if pipelined and fault.kind == "delay":
+            accepted = "with decisions sequential, or at level lockstep or sitl"
+            raise FieldError("faults", str(fault), accepted)
+    late = [fault for fault in faults if (fault.part, fault.kind) == ("camera", "delay")]
+    if len(late) > 1:
+        raise FieldError("faults", str(late[1]), "one delay of the camera at level gym")
+
+
+def _in_flight(fault: Fault) -> bool:
+    """Return whether it begins in the flight, or has acted since before it.
+
+    What ends before the policy takes over was never there. Neither was the picture of the ground.
+    """
+    from_the_start = fault.phase is None and not fault.at_s and fault.for_s is None
+    return fault.phase == "offboard" or (from_the_start and fault.kind != "stuck")

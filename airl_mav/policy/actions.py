@@ -174,7 +174,7 @@ def flyable(action: AnyAction, kind: CommandKind, speed_m_s: float) -> AnyAction
 
     Raises:
         TypeError: It is of another kind.
-        ValueError: An attitude, a body rate or a thrust is no number: nothing is safe to put in its
+        ValueError: An attitude, a body rate or a thrust is no number. Nothing is safe to put in its
             place.
     """
     wanted = KINDS[kind]

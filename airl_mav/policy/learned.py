@@ -40,7 +40,7 @@ from airl_mav.profiles.loading import profiles_dir
 class LearnedPolicy:
     """A network with its card. Implements `actions.Policy`.
 
-    A network with a memory remembers one flight, or n side by side: an object flies them from
+    A network with a memory remembers one flight, or n side by side. An object flies them from
     their first decision to their last, and `with_generator` gives the one for the next flight.
     """
 

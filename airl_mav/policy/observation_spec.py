@@ -18,11 +18,15 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core import plugins
 from airl_mav.core.fields import ProfileModel, later_field, quantity
 from airl_mav.policy.scans import goes_round
-from airl_mav.profiles.camera import Coefficients
-from airl_mav.profiles.camera_kind import CHANNELS, CameraKind
+from airl_mav.profiles.camera import Coefficients, camera_named
+from airl_mav.profiles.camera_kind import (
+    CHANNELS,
+    CYLINDER_MOST_DEG,
+    CameraKind,
+    Projection,
+    check_fov,
+)
 from airl_mav.profiles.distortion import UNDISTORTED, check_distortion, distorted, undistorted
-from airl_mav.profiles.further_cameras import camera_named
-from airl_mav.profiles.projection import CYLINDER_MOST_DEG, Projection, check_fov
 
 SHIPPED = ("body", "paper", "scan")
 LayoutName = Annotated[str, plugins.part_name(plugins.LAYOUTS, SHIPPED)]

@@ -30,7 +30,7 @@ _DENSE = ("Gemm", "MatMul")
 def quantised(model: bytes, frames: Encoded) -> bytes:
     """Return a network whose convolutions and dense layers compute in 8-bit integers.
 
-    Inputs and outputs stay what they are. The last dense layer stays in floats: it is small, and
+    Inputs and outputs stay what they are. The last dense layer stays in floats. It is small, and
     with it in integers scores that lie close together change places. The graph has a pair of
     QuantizeLinear and DequantizeLinear around each tensor (QDQ), which ONNX Runtime fuses where the
     processor has integer kernels.

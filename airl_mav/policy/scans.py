@@ -27,7 +27,7 @@ from airl_mav.policy.observation import Observation
 Floats = NDArray[np.float64]
 
 BAND_M = 0.9
-"""Returns so much higher or lower than the camera belong to the scan: a row of a coarse image
+"""Returns so much higher or lower than the camera belong to the scan. A row of a coarse image
 (2 degrees) is 0.7 m high at 20 m, so that one at least is inside."""
 
 NEAREST_M = 0.3

@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from airl_mav.core.fields import ProfileModel, later_field, quantity
-from airl_mav.profiles.mesh_file import MeshFile
+from airl_mav.profiles.asset_files import MeshFile
 
 MOST_PARTS = 128
 """Parts of one asset: every ray and every contact looks at each."""

@@ -50,7 +50,7 @@ class Vision(ProfileModel):
     """Visual-inertial odometry, or a motion capture system: the pose in a frame of its own.
 
     The frame is the vehicle's at the start. What drifts does so with the way and with time, for
-    good: nothing is seen a second time.
+    good. Nothing is seen a second time.
     """
 
     rate_hz: float = quantity("poses a second", "Hz", ge=5, le=250)

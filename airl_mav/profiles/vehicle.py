@@ -13,10 +13,8 @@ from pydantic import (
 from airl_mav.core.constants import C_PER_MAH, GRAVITY_M_S2
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.fields import ProfileModel, later_field, quantity
-from airl_mav.core.frames import Geodetic
-from airl_mav.core.location import HOME
-from airl_mav.profiles.camera import Camera
-from airl_mav.profiles.further_cameras import FurtherCameras, check_rates, with_the_rate
+from airl_mav.core.frames import HOME, Geodetic
+from airl_mav.profiles.camera import Camera, FurtherCameras, check_rates, with_the_rate
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.parameters import SPECS, parameter_values
 from airl_mav.profiles.sensors import Sensors

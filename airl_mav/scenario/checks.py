@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 from airl_mav.core.errors import FieldError
 from airl_mav.faults.kinds import LINKS
-from airl_mav.faults.model import Fault
-from airl_mav.faults.twin import TWIN, check_twin
+from airl_mav.faults.model import TWIN, Fault, check_twin
 from airl_mav.profiles.camera_kind import SLOW, Renderer
 from airl_mav.profiles.sensors import Sensors
 from airl_mav.scenario.aircraft import GREATEST_PORT, HAS_PYBULLET, NO_TWIN, Aircraft, Ports

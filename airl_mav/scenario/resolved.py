@@ -99,7 +99,7 @@ class ResolvedScenario:
         """All that is written down of a run, as plain values.
 
         The scenario with absolute paths, and with what was left open decided, so that a default and
-        the same value asked for are one run; and the content of profiles and policy: a name does
+        the same value asked for are one run; and the content of profiles and policy. A name does
         not tell a changed one.
         """
         pilot = asdict(self.pilot)
@@ -169,7 +169,7 @@ class ResolvedScenario:
         """Return the arena of the episode of a seed. Raises UsageError if none can be made.
 
         Moving obstacles are where the seed's tours begin when navigation does, as nearly as that is
-        known beforehand: the same seed is the same scene at every level.
+        known beforehand. The same seed is the same scene at every level.
         """
         # Imported here: it takes scipy, which a companion has no need of.
         from airl_mav.arena.generate import generate

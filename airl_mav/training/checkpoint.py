@@ -2,7 +2,7 @@
 
 A checkpoint is a folder, written under another name, synced and renamed. Then the file `latest`
 names it, so that there is always a whole one. Save between two rollouts only (stable-baselines3's
-`on_rollout_start`): within one, part of the state is in local variables. Nothing is unpickled.
+`on_rollout_start`). Within one, part of the state is in local variables. Nothing is unpickled.
 """
 
 from __future__ import annotations

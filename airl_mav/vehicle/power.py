@@ -2,6 +2,7 @@
 
 One kernel for plant and batch twin. Both models give the aircraft's own power, its flight
 controller included. The onboard computer's watts come beside it.
+The battery is a coulomb counter behind an open-circuit voltage and an internal resistance.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from airl_mav.core.constants import AIR_DENSITY_KG_M3, G_PER_KG, GRAVITY_M_S2
+from airl_mav.core.constants import AIR_DENSITY_KG_M3, C_PER_MAH, G_PER_KG, GRAVITY_M_S2
 from airl_mav.core.frames import Vector
 from airl_mav.core.kernels import kernel
 from airl_mav.profiles.vehicle import CORNERS, VehicleProfile
@@ -132,7 +133,7 @@ def momentum_power_w(
     P0 = (1/FM - kappa) T v_h, so that a hover takes T^1.5 / sqrt(2 rho A) / FM / eta. The body's
     drag is in T V_c: a vehicle that flies level leans its thrust against it.
 
-    A negative V_c counts as 0: momentum theory does not hold from a hover down to twice the
+    A negative V_c counts as 0. Momentum theory does not hold from a hover down to twice the
     induced velocity, where the rotors fly in their own wake, and a descent measured on a 3DR Solo
     saved 10 % (discuss.ardupilot.org, thread 32200).
 
@@ -229,7 +230,7 @@ def flight_power_w(
 def standing_power_w(thrust: float, airframe: Airframe, m: PowerModel) -> float:
     """Return the power of a vehicle that touches something [W]: that of its thrust at rest.
 
-    A regression is one of flight, and an impact is no electrical load: its hover is scaled by
+    A regression is one of flight, and an impact is no electrical load. Its hover is scaled by
     T^1.5, as momentum theory has it.
     """
     if m.momentum != 0.0:
@@ -250,3 +251,25 @@ def level_power_w(speed: float, airframe: Airframe, m: PowerModel) -> float:
     climb = speed * drag / thrust
     in_plane = speed * weight / thrust
     return momentum_power_w(thrust, airframe.thrust_max, in_plane * in_plane, climb, m)
+
+
+@kernel
+def terminal_voltage(open_circuit_v: float, resistance_ohm: float, power: float) -> float:
+    """Return the voltage under a constant-power load [W]: V = E - R P / V, upper root.
+
+    Above the greatest power that the pack can deliver, E²/4R, the voltage at that power: E/2.
+    """
+    discriminant = open_circuit_v * open_circuit_v - 4.0 * resistance_ohm * power
+    return 0.5 * (open_circuit_v + math.sqrt(max(0.0, discriminant)))
+
+
+@kernel
+def open_circuit(remaining: float, empty_v: float, full_v: float) -> float:
+    """Return the open-circuit voltage, linear in the state of charge 0..1."""
+    return empty_v + (full_v - empty_v) * remaining
+
+
+@kernel
+def drain(remaining: float, current_a: float, capacity_mah: float, dt: float) -> float:
+    """Return the state of charge after dt [s] at a current [A], not below 0."""
+    return max(0.0, remaining - current_a * (dt / (capacity_mah * C_PER_MAH)))

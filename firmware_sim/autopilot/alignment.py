@@ -9,8 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from airl_mav.core.constants import US_PER_S
-from airl_mav.core.frames import Geodetic, Vector, quat_from_euler
-from airl_mav.core.location import MAGNETIC_DECLINATION
+from airl_mav.core.frames import MAGNETIC_DECLINATION, Geodetic, Vector, quat_from_euler
 from airl_mav.vehicle.atmosphere import altitude_m
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.magnetic_field import FieldCheck

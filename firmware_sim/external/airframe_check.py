@@ -32,7 +32,7 @@ _ARDUPILOT_QUAD_X: Mapping[int, Corner] = dict(enumerate(CORNERS, start=1))
 
 @dataclass(frozen=True)
 class Airframe:
-    """What one kind of firmware must be configured to."""
+    """Required configuration of one kind of firmware."""
 
     firmware: str
     """Name of the firmware in messages: PX4."""

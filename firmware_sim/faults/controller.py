@@ -16,7 +16,7 @@ from firmware_sim.plant.plant import Plant
 
 
 class FailingParts:
-    """What lies between the plant and the flight controller, and fails.
+    """Failing parts between the plant and the flight controller.
 
     It works on any flight controller: the built-in one, or real firmware behind its simulator
     interface.

@@ -111,7 +111,7 @@ class Lane(Generic[Frame]):
 
 
 class FailingSender:
-    """What sends to one peer over a failing link. Implements `endpoint.Endpoint`."""
+    """Sender to one peer over a failing link. Implements `endpoint.Endpoint`."""
 
     def __init__(self, endpoint: Endpoint, clock: Clock, *, conducted: bool) -> None:
         """Take what sends over a healthy link; the rest as of `FailingEndpoint`."""

@@ -42,7 +42,7 @@ INERTIAL = ("accel", "gyro")
 
 
 class Effect(Protocol):
-    """What a fault does to one sensor; has a memory of its own."""
+    """Effect of a fault on one sensor; has a memory of its own."""
 
     def __call__(self, value: Any, time_us: int) -> Any:
         """Return what is measured instead of `value` at a time; None: nothing is, in this tick."""

@@ -1,4 +1,4 @@
-"""Which faults of an episode act now, and which have acted: what all places of faults share."""
+"""Faults of an episode that act now, and that have acted."""
 
 from __future__ import annotations
 
@@ -31,12 +31,11 @@ class Acting(NamedTuple):
     """A fault that acts now."""
 
     number: int
-    """Which one of the episode it is, from 0."""
+    """Number in the episode, from 0."""
     fault: Fault
     since_us: int
-    """When it began [µs]."""
     until_us: int
-    """When it ends; `FOREVER_US` for never [µs]."""
+    """`FOREVER_US` for never."""
 
 
 class Acted(NamedTuple):

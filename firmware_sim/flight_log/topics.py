@@ -1,4 +1,4 @@
-"""What is logged: uORB topics of PX4 1.16, with its names, units and intervals.
+"""Logged uORB topics of PX4 1.16, with its names, units and intervals.
 
 A topic has those of PX4's fields that mean something here; a log describes itself, so readers find
 fields by name. Intervals: PX4's default profile (SDLOG_PROFILE), src/modules/logger.

@@ -11,8 +11,7 @@ import numpy as np
 from airl_mav.core.clock import Clock
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.frames import Vector
-from airl_mav.core.signing import Signing
-from airl_mav.core.signing_key import StoredSigning
+from airl_mav.core.signing import Signing, StoredSigning
 from firmware_sim.autopilot.autopilot_state import AutopilotState, Message
 from firmware_sim.autopilot.port import AutopilotPort
 from firmware_sim.engine.record import Record

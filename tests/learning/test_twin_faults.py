@@ -18,8 +18,7 @@ from airl_mav.envs.spec import spec_of
 from airl_mav.envs.trace import Trace
 from airl_mav.envs.winds import Winds
 from airl_mav.experiments.gym_flier import GymFlier
-from airl_mav.faults.model import Fault
-from airl_mav.faults.twin import check_twin
+from airl_mav.faults.model import Fault, check_twin
 from airl_mav.profiles.conditions import WindSettings
 from airl_mav.rehearsal.run_folder import RunFolder
 from airl_mav.scenario.aircraft import Aircraft

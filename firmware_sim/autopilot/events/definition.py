@@ -1,4 +1,4 @@
-"""What an event is: a definition with words, and one that happened, as it goes over the wire.
+"""Events: a definition with words, and one that happened, as it is sent.
 
 Source: https://mavlink.io/en/services/events.html, and PX4 1.16,
 platforms/common/include/px4_platform_common/events.h.
@@ -39,7 +39,7 @@ FORMATS = {
 
 
 class Level(IntEnum):
-    """How urgent an event is; nobody is told of PROTOCOL, which is for ground stations' own use."""
+    """Urgency of an event. PROTOCOL is for ground stations' own use."""
 
     EMERGENCY = 0
     ALERT = 1

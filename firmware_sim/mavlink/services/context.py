@@ -1,4 +1,4 @@
-"""What a service may use while it handles a message."""
+"""Context of the handlers: a client, its link, the autopilot, and shared state."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ ANY = 0
 
 @dataclass(slots=True)
 class Context:
-    """What a handler may use for one client; the server updates `now_us` for every message."""
+    """State of one client for its handlers. The server updates `now_us` for every message."""
 
     link: Link
     """Answers and streams of the client that asks, and of nobody else."""
@@ -48,7 +48,6 @@ class Context:
     signing: Signing
     """The key of all links, if there is one."""
     system_id: int = SYSTEM_ID
-    """Of this vehicle."""
     next_parameter: int | None = None
     """Index that a running parameter list sends next; -1 = the hash; None = no list is running."""
     transfer: MissionTransfer = field(default_factory=MissionTransfer)

@@ -85,7 +85,7 @@ def handle_request(message: WireMessage, context: Context) -> bool:
 
 
 class Answered(NamedTuple):
-    """What an answer says of its request."""
+    """Fields of an answer about its request."""
 
     sequence: int
     session: int

@@ -50,7 +50,7 @@ class Request:
     opcode: int
     offset: int
     size: int
-    """Of the data; in a read, how much is wanted."""
+    """Size of the data; in a read, the requested size."""
     data: bytes
 
     @property
@@ -65,7 +65,7 @@ class Session:
 
     file: BinaryIO | None = None
     size: int = 0
-    """Of the file when it was opened [bytes]."""
+    """Size of the file when it was opened [bytes]."""
 
     def opened(self, request: Request) -> BinaryIO:
         """Return the open file. Raises RefusedError when there is none."""
@@ -189,7 +189,6 @@ class LogStream:
         self.waiting: Piece | None = None
         """A piece of the head that is not yet acknowledged."""
         self.sent_us = 0
-        """When it was sent [µs]."""
         self.tries = 0
         self._head_bytes = head_bytes
         self._offset = 0
@@ -268,7 +267,7 @@ NOBODY = (-1, -1)
 
 
 class Activity(Enum):
-    """What a link's mission protocol is doing."""
+    """State of a link's mission protocol."""
 
     IDLE = auto()
     SENDING = auto()
@@ -291,21 +290,21 @@ class MissionTransfer:
     """The item that the upload marks as current; -1 = none."""
     checksum: int = 0
     items: list[PlanItem] = field(default_factory=list)
-    """What has been uploaded so far."""
+    """Items uploaded so far."""
     partner: tuple[int, int] = NOBODY
     """System and component id of the client."""
     integer: bool = False
-    """Whether items travel as MISSION_ITEM_INT; PX4 begins with MISSION_REQUEST and learns."""
+    """Items travel as MISSION_ITEM_INT; PX4 begins with MISSION_REQUEST and learns."""
     sent_us: int = 0
-    """When the client was last asked."""
+    """Time of the newest request to the client."""
     heard_us: int = 0
-    """When the client was last heard."""
+    """Time of the client's newest message."""
 
     # What this link has told its clients of the mission.
     told_current: int = 0
     told_reached: int = -1
     repeats: int = 0
-    """How often the newest MISSION_ITEM_REACHED has been repeated."""
+    """Repetitions of the newest MISSION_ITEM_REACHED."""
     repeated_us: int = 0
     told_jumped: tuple[int, int] = (-1, 0)
 
@@ -317,7 +316,7 @@ class Step(NamedTuple):
     """A text of a calibration."""
 
     after_s: float
-    """How long after the one before [s]."""
+    """Time after the text before [s]."""
     message: Message
 
 
@@ -327,7 +326,7 @@ class RunningCalibration:
     def __init__(self) -> None:
         self.sensor = ""
         self.radio = False
-        """Whether a ground station calibrates a radio: it ends that with a cancellation."""
+        """A ground station calibrates a radio: it ends that with a cancellation."""
         self._steps: Iterator[Step] = iter(())
         self._next: Step | None = None
         self._due_us = 0
@@ -369,6 +368,6 @@ class Shell:
     """One client's shell."""
 
     line: bytearray = field(default_factory=bytearray)
-    """What was typed of a line that has not ended."""
+    """Typed characters of an unfinished line."""
     output: bytearray = field(default_factory=bytearray)
-    """What is still to be sent."""
+    """Text to be sent."""

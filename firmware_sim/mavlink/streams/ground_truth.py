@@ -7,8 +7,7 @@ it. Source: PX4 1.16, streams/HIL_STATE_QUATERNION.hpp.
 
 from __future__ import annotations
 
-from airl_mav.core.frames import local_to_geodetic
-from airl_mav.core.location import HOME
+from airl_mav.core.frames import HOME, local_to_geodetic
 from firmware_sim.interfaces import Truth
 from firmware_sim.mavlink.codec import Values
 from firmware_sim.mavlink.streams import units
