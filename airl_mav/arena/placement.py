@@ -77,10 +77,8 @@ def place_all(
 ) -> Floats:
     """Draw places (n, 2) [m] of bounding boxes (n, 2) `gap_m` apart from each other and the walls.
 
-    `keep_off` are other boxes, any clearance already added.
-
-    Raises:
-        NoRoomError: One found no place in TRIES tries; `progress` is the number of placed boxes.
+    `keep_off` are other boxes, any clearance already added. Raises NoRoomError: one found no place
+    in TRIES tries; `progress` is the number of placed boxes.
     """
     n, boxes = len(halves), with_room(keep_off, halves + gap_m)
     low, high = inner(bounds, 0.0)

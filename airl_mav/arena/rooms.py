@@ -96,8 +96,7 @@ def draw_plan(
 ) -> Plan:
     """Draw the rooms of an arena within bounds, without walls in `keep_off`.
 
-    Raises:
-        UsageError: No such plan was found.
+    Raises UsageError: no such plan was found.
     """
     rooms, width_m = spec.rooms, spec.rooms.corridor_width_m
     count = int(rng.integers(*rooms.count, endpoint=True))

@@ -122,8 +122,7 @@ def utc_now() -> datetime:
 def since_1970_us(timestamp: str) -> int:
     """Return a calendar time, written as ISO 8601 with its offset from UTC, since 1970 [µs].
 
-    Raises:
-        ValueError: The text is no such time.
+    Raises ValueError if the text is no such time.
     """
     return round(datetime.fromisoformat(timestamp).timestamp() * US_PER_S)
 

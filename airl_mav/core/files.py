@@ -44,9 +44,8 @@ DEEPEST = 100
 def replace_file(path: Path, data: bytes) -> None:
     """Write a file so that a reader sees the old one or the whole new one, never a part.
 
-    Raises:
-        OSError: It cannot be written, a full disk above all. Its `filename` is the path. The old
-            file is untouched, and nothing is left beside it.
+    Raises OSError if it cannot be written, a full disk above all. Its `filename` is the path. The
+    old file is untouched, and nothing is left beside it.
     """
     with replacing(path) as partial:
         partial.write_bytes(data)
@@ -56,8 +55,7 @@ def replace_file(path: Path, data: bytes) -> None:
 def replacing(path: Path) -> Iterator[Path]:
     """Yield the temporary name of a file. On leaving it takes the place of `path`.
 
-    Raises:
-        OSError: As `replace_file`.
+    Raises OSError as `replace_file`.
     """
     partial = path.with_name(path.name + ".partial")
     try:
@@ -314,8 +312,7 @@ def add_arrays(path: Path, groups: Mapping[str, Mapping[str, NDArray[Any]]]) -> 
 def read_groups(path: Path) -> dict[str, ArrayGroup]:
     """Return all groups of arrays of an archive; none when there is no file.
 
-    Raises:
-        UsageError: It cannot be read or is damaged.
+    Raises UsageError if it cannot be read or is damaged.
     """
     if not path.exists():
         return {}

@@ -203,7 +203,6 @@ class _Running:
     reader: threading.Thread | None = None
     """Reads what it prints."""
     count: int = 0
-    """Kernels compiled so far."""
 
 
 class _Step:

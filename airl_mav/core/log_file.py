@@ -35,7 +35,6 @@ class LogFile:
         self.lost = False
         """Whether it ended early."""
         self.failure: OSError | None = None
-        """Why it did."""
         self.partial_path = path.with_name(path.name + PARTIAL_SUFFIX)
         self._buffer = bytearray()
         self._written = 0

@@ -184,8 +184,7 @@ SAVE_EVERY_US = 60 * US_PER_S
 def read_key(path: Path) -> bytes:
     """Return the 32 bytes that a file holds as 64 hexadecimal digits.
 
-    Raises:
-        FieldError: The file is missing, others may read it, or it holds no key.
+    Raises FieldError if the file is missing, others may read it, or it holds no key.
     """
     try:
         mode = path.stat().st_mode

@@ -308,8 +308,7 @@ _MS_PER_S = 1000.0
 def read_fault(text: str) -> dict[str, Any]:
     """Return the fields of a fault that is written in words.
 
-    Raises:
-        ValueError: It cannot be read; one line that says where, and what is accepted.
+    Raises ValueError if it cannot be read; one line that says where, and what is accepted.
     """
     words = text.split()
     if len(words) > 1 and words[0] == "motor" and f"motor{words[1]}" in MOTORS:

@@ -18,8 +18,7 @@ LONGEST_S = 100_000.0
 class Fault(ProfileModel):
     """A fault, as a table of a scenario file: `[[faults]]`, or in words, as `gps off at 8s for 5s`.
 
-    Raises:
-        ValueError: The words, or the fields together, describe no fault (as pydantic has it).
+    Raises ValueError if the words, or the fields together, describe no fault (as pydantic has it).
     """
 
     part: Part = Field(description="what fails")

@@ -247,8 +247,7 @@ def digest(data: bytes) -> str:
 def read_card(folder: Path) -> PolicyCard:
     """Read the card of a policy without a look at the policy itself.
 
-    Raises:
-        UsageError: There is none, or it has a field that is missing, unknown or out of range.
+    Raises UsageError if there is none, or it has a field that is missing, unknown or out of range.
     """
     path = folder / CARD_FILE
     data = read_json(path, SCHEMA, "policy")
@@ -273,9 +272,8 @@ def read_torch_program(folder: Path, card: PolicyCard) -> bytes:
 def load_card(folder: Path, *, trust: bool = False) -> PolicyCard:
     """Read the card of a policy and hold the policy against it.
 
-    Raises:
-        UsageError: See `read_card`; also when the file has another digest, or other inputs and
-            outputs than the card says, or the card names code and there is no trust.
+    Raises UsageError: see `read_card`; also when the file has another digest, or other inputs and
+    outputs than the card says, or the card names code and there is no trust.
     """
     card = read_card(folder)
     open_model(folder, card, trust=trust)

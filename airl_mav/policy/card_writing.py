@@ -27,9 +27,7 @@ def write_card(folder: Path, card: PolicyCard) -> None:
     """Write the card beside the policy that it is for. The old card stays until the new is whole.
 
     Its page for people, `README.md`, is written after it, unless somebody else's has that name.
-
-    Raises:
-        UsageError: The folder holds another policy, or none.
+    Raises UsageError if the folder holds another policy, or none.
     """
     read_model(folder, card)
     if card.torch_sha256 is not None:
@@ -49,8 +47,7 @@ def write_model_card(folder: Path, card: PolicyCard) -> None:
 def add_result(folder: Path, result: MeasuredResult) -> PolicyCard:
     """Write a result onto a card, in place of an earlier one of the same arena, level and latency.
 
-    Raises:
-        UsageError: See `read_card`.
+    Raises UsageError: see `read_card`.
     """
     card = read_card(folder)
     others = [each for each in card.results if _conditions(each) != _conditions(result)]
@@ -70,11 +67,8 @@ def copy_policy(
     """Write a policy's network to another folder, its card with changes, and return the card.
 
     Measurements of the source do not apply. The card has no results until it is evaluated. `trust`
-    permits the source's maker to run code on this machine.
-
-    Raises:
-        UsageError: The policy cannot be used, a change is out of range, or `out` is the source or
-            cannot be written.
+    permits the source's maker to run code on this machine. Raises UsageError if the policy cannot
+    be used, a change is out of range, or `out` is the source or cannot be written.
     """
     card = load_card(source, trust=trust)
     if out.resolve() == source.resolve():

@@ -68,8 +68,7 @@ STRIP_HALF_WIDTH = 1
 def boxes(spec: ObservationSpec) -> dict[str, Box]:
     """Return the arrays of a layout, by key.
 
-    Raises:
-        UsageError: A layout of the user's has others than a network can take.
+    Raises UsageError if a layout of the user's has others than a network can take.
     """
     if spec.layout not in SHIPPED:
         return own_boxes(spec)

@@ -182,11 +182,8 @@ def load_learned(
 
     The card is read where none is given. `runtime`, `threads` and `trust` are those of
     `open_network`, `rng` and `ablate` those of `LearnedPolicy`. An inference is made at once, so
-    that the first decision in the air is no slower than the others.
-
-    Raises:
-        UsageError: Card and policy do not fit each other, or the runtime is not installed or not
-            trusted.
+    that the first decision in the air is no slower than the others. Raises UsageError: card and
+    policy do not fit each other, or the runtime is not installed or not trusted.
     """
     card = card or read_card(folder)
     check_trust(folder, card, trust=trust)

@@ -79,7 +79,6 @@ class View:
     """What a further camera shows, of one vehicle or with a leading axis of n."""
 
     image: NDArray[Any]
-    """As `Observation.image`."""
     intrinsics: Intrinsics
     earlier: tuple[NDArray[Any], ...] = ()
     """Its images of the decisions before, as far as they are kept, the newest first."""

@@ -73,9 +73,7 @@ class Scanning(NamedTuple):
     """What makes scans."""
 
     level: Callable[[NDArray[np.uint16], Rays, Tilt, int], Floats]
-    """See `level_scan`."""
     carried: Callable[[Floats, Moved, float], Floats]
-    """See `carried`."""
 
 
 @cache

@@ -116,11 +116,9 @@ class Compensator:
     ) -> None:
         """Prepare n companions of one vehicle, whose camera has these intrinsics.
 
-        So many images are `remembered`: the newest, and those that fill what it did not see.
-
-        Raises:
-            FieldError: The vehicle's profile does not say how it answers setpoints, or the camera
-                gives no depth.
+        So many images are `remembered`: the newest, and those that fill what it did not see. Raises
+        FieldError if the vehicle's profile does not say how it answers setpoints, or the camera
+        gives no depth.
         """
         if intrinsics.kind != "depth":
             raise FieldError(

@@ -188,9 +188,8 @@ class ComputerProfile(ProfileModel):
 def load_computer(name: str) -> ComputerProfile:
     """Load a computer profile, shipped or by path, with its sample files read in.
 
-    Raises:
-        UsageError: See `load_profile`; also when a sample file is missing or holds anything but
-            latencies in (0, 60000] ms.
+    Raises UsageError: see `load_profile`; also when a sample file is missing or holds anything but
+    latencies in (0, 60000] ms.
     """
     profile = load_profile("computers", name, ComputerProfile)
     folder = Path(name).parent if name.endswith(".toml") else profiles_dir() / "computers"

@@ -67,8 +67,7 @@ def equipped(
 ) -> tuple[VehicleProfile, ComputerProfile]:
     """Load a vehicle and a computer by name or path; return the vehicle `loaded`, and the computer.
 
-    Raises:
-        UsageError: A profile cannot be used, or the rotors do not carry it all.
+    Raises UsageError if a profile cannot be used, or the rotors do not carry it all.
     """
     board = load_computer(computer)
     return loaded(load_vehicle(vehicle), board, payload), board

@@ -367,10 +367,8 @@ class Scenario(Flights, Lateness, Decisions, Aircraft):
 
     The fields are flat, but for the tables `payload`, `wind`, `spread`, `sensors`, `watchdog`,
     `limits`, `real` and `ports`. What is left at None is decided by
-    `airl_mav.scenario.resolve.resolve`, mostly from the policy's card.
-
-    Raises:
-        FieldError: A field is unknown, of the wrong type, or out of range.
+    `airl_mav.scenario.resolve.resolve`, mostly from the policy's card. Raises FieldError if a field
+    is unknown, of the wrong type, or out of range.
     """
 
     policy: PolicyName = DEFAULT_POLICY

@@ -62,7 +62,6 @@ class PlannedEpisode:
     """An episode to be flown."""
 
     index: int
-    """Its number in the run."""
     seed: int
 
 
@@ -71,7 +70,6 @@ class ResolvedScenario:
     """A scenario, checked, and the content of every profile that it names."""
 
     scenario: Scenario
-    """As it was asked for."""
     vehicle: VehicleProfile
     """With its computer and payload on board."""
     arena: ArenaSpec
@@ -258,8 +256,7 @@ class ResolvedScenario:
     def fresh_policy(self, seed: int) -> Policy:
         """Return the policy as it begins the flight of a seed: it remembers nothing.
 
-        Raises:
-            UsageError: It cannot be run as asked.
+        Raises UsageError if it cannot be run as asked.
         """
         loaded = self._loaded_policy
         if isinstance(loaded, LearnedPolicy):

@@ -184,8 +184,7 @@ def _mean(values: Sequence[float | None]) -> float | None:
 def estimated_ms(computer: ComputerProfile, macs: int) -> float:
     """Return a network's mean t2 [ms], scaled by MACs from the computer's nearest workload.
 
-    Raises:
-        UsageError: The computer has no workload.
+    Raises UsageError if the computer has no workload.
     """
     latency = choose_injection(computer, ESTIMATE, macs=macs).latency
     if not isinstance(latency, Latency):

@@ -85,9 +85,7 @@ class TrainingResult(NamedTuple):
 
     folder: TrainingFolder
     best: Evaluation
-    """The evaluation of the exported weights."""
     card: PolicyCard
-    """Card of the policy in `folder.policy`."""
 
 
 def nominal(spec: EnvironmentSpec) -> EnvironmentSpec:
@@ -173,9 +171,8 @@ def fit(
 ) -> Evaluation:
     """Train in a locked folder from the newest checkpoint; return the best weights' evaluation.
 
-    Raises:
-        UsageError: The algorithm does not fit the environment, an arena cannot be made, or initial
-            weights are missing.
+    Raises UsageError if the algorithm does not fit the environment, an arena cannot be made, or
+    initial weights are missing.
     """
     check_actions(config.algorithm.name, kind_of(config.environment.actions))
     env = environment_of(config, watcher)

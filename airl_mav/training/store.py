@@ -86,7 +86,6 @@ class TrainingFolder:
         """The best weights so far, as stable-baselines3 saves them."""
         self.zones = path / "zones"
         self.policy = path / "policy"
-        """The exported result."""
 
     @classmethod
     def begin(

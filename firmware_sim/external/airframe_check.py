@@ -56,8 +56,7 @@ class Airframe:
 def px4_airframe(vehicle: VehicleProfile, output: str) -> Airframe:
     """Return a quad by PX4's control allocation; `output` is SITL_OUTPUT or HITL_OUTPUT.
 
-    Raises:
-        FirmwareMissingError: The profile has no section on PX4.
+    Raises FirmwareMissingError if the profile has no section on PX4.
     """
     px4 = vehicle.px4
     if px4 is None:

@@ -136,8 +136,7 @@ class FirmwareProcess(ChildProcess):
     def __init__(self, name: str, command: StartCommand, cwd: Path, log: Path) -> None:
         """Start a named program in a folder, appending its output to `log`.
 
-        Raises:
-            FirmwareMissingError: The program is missing or not executable.
+        Raises FirmwareMissingError if the program is missing or not executable.
         """
         self.name = name
         program = Path(command.argv[0])

@@ -42,7 +42,6 @@ class Board:
         self.autopilot = 0
         """MAV_AUTOPILOT of its heartbeats."""
         self.beats = 0
-        """Heartbeats received."""
         self.hil = False
         """Whether its newest heartbeat has the HIL flag."""
         self.armed = False

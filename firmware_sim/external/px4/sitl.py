@@ -85,12 +85,9 @@ class Px4Bridge:
         self.armed = False
         self.time_us = 0
         self.unanswered = 0
-        """Samples sent before PX4's first answer."""
         self.duplicates = 0
-        """Answers beyond the first to a sample."""
         self._tcp = TcpPort(port)
         self.port = self._tcp.port
-        """The port it listens on."""
         self._answer_s, self._start_s = answer_s, start_s
         self._clock = WallClock()
         self._alive: Callable[[], None] = no_process

@@ -51,23 +51,17 @@ class Context:
     next_parameter: int | None = None
     """Index that a running parameter list sends next; -1 = the hash; None = no list is running."""
     transfer: MissionTransfer = field(default_factory=MissionTransfer)
-    """The link's part in the mission protocol."""
     storage: Storage = field(default_factory=Storage)
     """The vehicle's files, the same for all clients."""
     ftp: FtpClient = field(default_factory=FtpClient)
-    """The client's part in MAVLink FTP."""
     shell: Shell = field(default_factory=Shell)
-    """The client's part in the shell."""
     calibration: RunningCalibration = field(default_factory=RunningCalibration)
     """The vehicle's, the same for all clients."""
     radio: Radio = field(default_factory=Radio)
     """The newest channels of a radio, the same for all clients."""
     log_listing: LogListing | None = None
-    """The entries of logs that are still to be sent."""
     log_download: LogDownload | None = None
-    """The part of a log that is still to be sent."""
     log_stream: LogStream | None = None
-    """The log that is sent while it is written."""
     refusals: set[str] = field(default_factory=set)
     """Why setpoints have been refused since the last one that was accepted."""
 
@@ -120,11 +114,9 @@ class Command:
     """A COMMAND_LONG or COMMAND_INT."""
 
     number: int
-    """MAV_CMD."""
     params: tuple[float, float, float, float, float, float, float]
     """Parameters 1..7 of COMMAND_LONG; NaN = not given."""
     sender: tuple[int, int] = (0, 0)
-    """System and component id of who asks."""
     frame: int | None = None
     """MAV_FRAME of a COMMAND_INT."""
 

@@ -121,7 +121,6 @@ class FtpClient:
     summing: Summing | None = None
     used_us: int = 0
     last_sequence: int | None = None
-    """Of the request that `last_answer` answered."""
     last_answer: bytes = b""
 
     def close(self) -> None:
@@ -284,13 +283,11 @@ class MissionTransfer:
     kind: int = 0
     """MAV_MISSION_TYPE of the newest transfer."""
     index: int = 0
-    """The next item."""
     count: int = 0
     current: int = -1
     """The item that the upload marks as current; -1 = none."""
     checksum: int = 0
     items: list[PlanItem] = field(default_factory=list)
-    """Items uploaded so far."""
     partner: tuple[int, int] = NOBODY
     """System and component id of the client."""
     integer: bool = False
@@ -368,6 +365,4 @@ class Shell:
     """One client's shell."""
 
     line: bytearray = field(default_factory=bytearray)
-    """Typed characters of an unfinished line."""
     output: bytearray = field(default_factory=bytearray)
-    """Text to be sent."""
