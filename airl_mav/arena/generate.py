@@ -107,7 +107,7 @@ def generate(
 
     `spec.count_period` consecutive seeds, from 0 on, share their obstacle counts. The way from
     start to goal is at least `vehicle_width_m` wide. The curriculum `zone` bounds the goal, None =
-    the largest; the obstacles depend on it only if a first layout had no room for the goal. Raises
+    the largest. The obstacles depend on it only if a first layout had no room for the goal. Raises
     UsageError with the reason if an argument is invalid or LAYOUTS layouts had no arena.
     """
     if seed < 0:

@@ -75,8 +75,8 @@ def boxes_of_mesh(
 ) -> MeshBoxes:
     """Return a mesh as an asset of at most `most` boxes, with the finest possible cells.
 
-    The middle of the mesh's footprint is the asset's origin, its lowest point stands on the floor,
-    and its x axis points forward. The file is STL, OBJ, GLB, glTF, PLY or OFF, `scale` metres per
+    The middle of the mesh's footprint is the asset's origin. Its lowest point stands on the floor.
+    Its x axis points forward. The file is STL, OBJ, GLB, glTF, PLY or OFF. `scale` is metres per
     unit of it, `up` its axis that points up; "auto": y for GLB and glTF, else z. Raises UsageError
     if it cannot be read, holds no surface, or is too large for an asset.
     """

@@ -38,9 +38,9 @@ def draw_place(
 ) -> bool:
     """Draw a free place for a bounding box, uniform over all; return whether TRIES sufficed.
 
-    It must not overlap the boxes `center`, `taken` (k, 2), any clearance already added, and keeps
-    `gap_m` to the walls of the floor `low`..`high`. All are north, east [m], `half` and `taken`
-    half extents; `place` (2,) is written.
+    It must not overlap the boxes `center`, `taken` (k, 2), any clearance already added. It keeps
+    `gap_m` to the walls of the floor `low`..`high`. All are north, east [m]. `half` and `taken` are
+    half extents. `place` (2,) is written.
     """
     lowest = low + (half + gap_m)
     span, grown = high - (half + gap_m) - lowest, taken + half

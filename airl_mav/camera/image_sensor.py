@@ -49,7 +49,7 @@ def noisy(
     A pixel that reads x holds N = x full_well_e / max(gain, 1) electrons. A gain above 1 multiplies
     what was counted, one below 1 is a darker exposure. Their number has the variance N (Poisson's,
     in its normal approximation), reading it adds read_noise_e² (EMVA 1288, release 4.0, section 2).
-    The light is after the gain; above 1 the sensor is full.
+    The light is after the gain. Above 1 the sensor is full.
     """
     full = np.minimum(light, np.float32(1.0))
     per_light = full_well_e / max(gain, 1.0)

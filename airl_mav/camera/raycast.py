@@ -244,7 +244,7 @@ def render_depth(
         quaternion: (4,) unit [w, x, y, z] camera -> NED. Its x axis is the optical axis, y points
             to the right of the image, z to its bottom.
         focal: Focal length [px] of a pinhole, columns for an angle [px/rad] of a cylinder.
-        cx: Column of the optical axis; pixel centres are at whole numbers.
+        cx: Column of the optical axis. Pixel centres are at whole numbers.
         cy: Row of the optical axis.
         cylindrical: The image is a cylinder's, as `Intrinsics` defines it.
         max_range: Greatest depth that gives a return [m].

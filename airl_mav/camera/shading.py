@@ -207,7 +207,7 @@ def paint(
 
 @kernel
 def encoded(x: np.float32) -> np.int32:
-    """Return linear light as an sRGB number, 0..255 (IEC 61966-2-1); negative light is black.
+    """Return linear light as an sRGB number, 0..255 (IEC 61966-2-1). Negative light is black.
 
     The power is a minimax polynomial of the root, accurate to 0.09 of a step.
     """

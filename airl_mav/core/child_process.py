@@ -72,7 +72,7 @@ class ChildProcess:
     ) -> None:
         """Start a program.
 
-        What it prints is appended to `log`; with `capture_stdout` only its standard error is, and
+        What it prints is appended to `log`. With `capture_stdout` only its standard error is, and
         the parent reads its standard output (`stdout`). It needs the parent-death guard (`guarded`)
         unless it reads its pipe itself. `environment` is added to our own. File descriptors in
         `inherited` are locks that it never uses.

@@ -284,9 +284,9 @@ def save_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
 def add_arrays(path: Path, groups: Mapping[str, Mapping[str, NDArray[Any]]]) -> dict[str, str]:
     """Add groups of arrays to an .npz, made when there is none; return the CRC of each group.
 
-    Keys become `<group>/<name>`; all that the archive has of these groups is replaced. The file is
-    the old one or the whole new one. The old archive is copied as bytes and appended to, so that
-    adding costs a copy and not a second compression of the whole run.
+    Keys become `<group>/<name>`. All that the archive has of these groups is replaced. The file is
+    the old one or the whole new one. The old archive is copied as bytes and appended to. So adding
+    costs a copy, not a second compression of the whole run.
     """
     with replacing(path) as partial:
         old = path.exists()

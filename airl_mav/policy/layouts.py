@@ -95,10 +95,7 @@ def further_boxes(spec: ObservationSpec) -> dict[str, Box]:
 def encode_layout(spec: ObservationSpec, seen: Observation, shrink: Shrink = NUMPY) -> Encoded:
     """Return the arrays of a layout for n vehicles.
 
-    Args:
-        spec: The layout; its camera must fit (`camera_mismatch`).
-        seen: Of n vehicles: every array has a leading axis (n,).
-        shrink: What makes the network's images of the camera's; numpy by default.
+    Its camera must fit (`camera_mismatch`). Every array of `seen` has a leading axis (n,).
 
     Returns:
         The image uint8, the newest frame first: `depth` (n, frames, height, width), "no return"

@@ -195,9 +195,8 @@ def observe(
 ) -> Observation:
     """Return the observation of one vehicle, or of n.
 
-    `goal` is (..., 2) north, east [m], or (..., 3) with down, `in_flight` what is known of the
-    decisions, `earlier` the images of the decisions before with the states they were taken in, the
-    newest first, `further` the views of further cameras by name.
+    `goal` is (..., 2) north, east [m], or (..., 3) with down. `earlier` are the images and states
+    of the decisions before, the newest first. `further` are the views of further cameras by name.
     """
     roll, pitch, yaw = quats_to_euler(state.quaternion)
     to_goal = np.zeros_like(state.position)

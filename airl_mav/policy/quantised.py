@@ -30,10 +30,10 @@ _DENSE = ("Gemm", "MatMul")
 def quantised(model: bytes, frames: Encoded) -> bytes:
     """Return a network whose convolutions and dense layers compute in 8-bit integers.
 
-    Inputs and outputs stay what they are. The last dense layer stays in floats. It is small, and
-    with it in integers scores that lie close together change places. The graph has a pair of
-    QuantizeLinear and DequantizeLinear around each tensor (QDQ), which ONNX Runtime fuses where the
-    processor has integer kernels.
+    Inputs and outputs stay what they are. The last dense layer stays in floats. It is small. With
+    integers, scores that lie close together change places. The graph has a pair of QuantizeLinear
+    and DequantizeLinear around each tensor (QDQ). ONNX Runtime fuses them where the processor has
+    integer kernels.
 
     `model` is an .onnx file with its weights. The ranges are found with the rows of `frames`.
     Raises UsageError if onnx is not installed or cannot quantise the network.

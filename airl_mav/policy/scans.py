@@ -122,8 +122,8 @@ def level_scan(depth_mm: NDArray[np.uint16], rays: Rays, tilt: Tilt, bearings: i
 def carried(scans: Floats, moved: Moved, fov_rad: float) -> Floats:
     """Return earlier scans (n, bearings) as if nothing but the vehicles had moved.
 
-    Ranges [m] are infinite where nothing is. A return is as wide as its bearing was from where it
-    was seen. Hidden places stay unknown.
+    Ranges [m] are infinite where nothing is. A return keeps its angular width. Hidden places stay
+    unknown.
     """
     bearings = scans.shape[1]
     step = fov_rad / bearings

@@ -189,9 +189,9 @@ class Compensator:
     ) -> tuple[NDArray[np.uint16], Kinematics]:
         """Return images and motion of the vehicles at the time when their decisions will act.
 
-        Call it once a decision: the images are kept. Only the rows `who` (k,) decide; `depth_mm`
-        (n, h, w) are the newest images, 0 = no return, taken `age_us` (n,) ago; `now_us` (n,) is
-        when the decisions begin.
+        Call it once a decision: the images are kept. Only the rows `who` (k,) decide. `depth_mm`
+        (n, h, w) are the newest images, 0 = no return. They were taken `age_us` (n,) ago. The
+        decisions begin at `now_us` (n,).
         """
         roll, pitch, heading = quats_to_euler(state.quaternion)
         now = Motion(state.position, state.velocity, heading, self._heading_rate(now_us))

@@ -160,7 +160,7 @@ def run_sweep(
     """Run the remaining trials; `sweep.json` is written after each.
 
     All workers see the folder, new or to resume, under this path. `stop` is polled several times a
-    second; True stops the sweep and keeps finished trials. Returns the sweep so far, and the reason
+    second. True stops the sweep and keeps finished trials. Returns the sweep so far, and the reason
     of an early end or None. Raises UsageError for invalid input, or if the folder holds something
     else.
     """

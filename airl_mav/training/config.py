@@ -258,8 +258,8 @@ def configured(
 ) -> TrainingConfig:
     """Return a configuration with some of its values changed.
 
-    `steps` are decisions of all vehicles together, `computer` is the profile of whose `workload` t2
-    is drawn, `latency` names sources of t2 instead, `initial` is the training run with the initial
+    `steps` are decisions of all vehicles together. The latency t2 is drawn from a `workload` of the
+    `computer`, or from the sources `latency`. `initial` is the training run with the initial
     weights. Raises UsageError if a value is out of range, or needs another one.
     """
     if computer is not None and workload is None:

@@ -242,10 +242,9 @@ def check_spaces(
 def export(asked: export_request.ExportRequest, command: str) -> PolicyCard:
     """Export the .zip of an SB3 model, or a plain module, as a policy that flies; return its card.
 
-    A .zip holds pickled Python objects and a module is code: export only from people you trust.
-    `command` is the command line for the card. Raises UsageError if the model cannot be loaded or
-    exported or does not fit its description, or the folder is not writable. Then nothing usable was
-    written.
+    A .zip holds pickled Python objects and a module is code. Export only from people you trust.
+    Raises UsageError if the model cannot be loaded or exported or does not fit its description, or
+    the folder is not writable. Then nothing usable was written.
     """
     out = asked.out
     if out.exists() and not out.is_dir():

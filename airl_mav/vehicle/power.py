@@ -129,20 +129,16 @@ def momentum_power_w(
 ) -> float:
     """Return the power by momentum theory [W].
 
-    P = [kappa T v_i + P0 (1 + 4.65 mu²) + T max(V_c, 0)] / eta + P_avionics with
-    P0 = (1/FM - kappa) T v_h, so that a hover takes T^1.5 / sqrt(2 rho A) / FM / eta. The body's
-    drag is in T V_c: a vehicle that flies level leans its thrust against it.
+    P = [kappa T v_i + P0 (1 + 4.65 mu²) + T max(V_c, 0)] / eta + P_avionics with P0 = (1/FM -
+    kappa) T v_h. So a hover takes T^1.5 / sqrt(2 rho A) / FM / eta. The body's drag is in T V_c: a
+    vehicle that flies level leans its thrust against it.
 
-    A negative V_c counts as 0. Momentum theory does not hold from a hover down to twice the
-    induced velocity, where the rotors fly in their own wake, and a descent measured on a 3DR Solo
-    saved 10 % (discuss.ardupilot.org, thread 32200).
+    A negative V_c counts as 0. Momentum theory does not hold from a hover down to twice the induced
+    velocity. There the rotors fly in their own wake. A descent measured on a 3DR Solo saved 10 %
+    (discuss.ardupilot.org, thread 32200).
 
-    Args:
-        thrust: T, of all rotors [N].
-        thrust_max: Of one rotor at full command [N]. Its speed follows from it.
-        in_plane2: Square of the velocity in the plane of the discs against the air [m²/s²].
-        climb: V_c, velocity against the air along the thrust [m/s].
-        m: The model.
+    `thrust` is T, of all rotors [N]. The speed of a rotor follows from its `thrust_max`.
+    `in_plane2` and `climb`, V_c, are as of `induced_velocity`.
     """
     if thrust < LEAST_THRUST_N:
         return m.avionics_w

@@ -15,7 +15,7 @@ class ClientFaults:
     def __init__(self, timeline: Callable[[], FaultTimeline]) -> None:
         """Take what returns the faults of the episode, at the present time.
 
-        It is asked first when something is injected: until then nothing lies between the plant and
+        It is asked first when something is injected. Until then nothing lies between the plant and
         the flight controller.
         """
         self._timeline = timeline

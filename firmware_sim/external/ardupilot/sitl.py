@@ -66,7 +66,7 @@ thousandth of its time."""
 def state_line(time_us: int, sample: SensorSample, truth: Truth) -> bytes:
     """Return the answer to a servo packet: one line, a line feed before and after.
 
-    ArduPilot finds keys by substring and then reads with sscanf: nothing may stand between a key's
+    ArduPilot finds keys by substring and then reads with sscanf. Nothing may stand between a key's
     colon and its bracket, and no key may hold the name of a later one. Numbers are the shortest
     that read back as the same double. From `truth` ArduPilot simulates GPS, barometer and compass.
     """

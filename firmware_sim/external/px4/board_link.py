@@ -152,7 +152,7 @@ HIL_BYTES_S = TICK_HZ * SENSOR_BYTES + GPS_HZ * GPS_BYTES
 """What the simulator sends [bytes/s]."""
 
 HIL_SHARE = 2 / 3
-"""Largest share of a line's capacity that this may take: companion and ground station need the
+"""Largest share of a line's capacity that this may take. Companion and ground station need the
 rest."""
 
 USB_CLIENTS_BYTES_S = 100_000

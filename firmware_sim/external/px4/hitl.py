@@ -34,7 +34,7 @@ _BEHIND_US = 20_000
 
 
 class Pace:
-    """Limits ticks to 250 per second of wall time: the board's clock is not simulated.
+    """Limits ticks to 250 per second of wall time. The board's clock is not simulated.
 
     Where ticks are paced already, it adapts to the pace of the punctual ones and does not wait.
     """
@@ -62,7 +62,7 @@ class HitlBridge:
     """Flies one board for one episode. Implements `Bridge`.
 
     A lost device, missing or invalid motor commands, a restart or leaving HIL mode end the flight
-    (`FirmwareLostError`). Sensors are sent once HIL mode is reported, HIL_STATE_QUATERNION never: a
+    (`FirmwareLostError`). Sensors are sent once HIL mode is reported, HIL_STATE_QUATERNION never. A
     board takes it for its own estimate.
     """
 

@@ -30,21 +30,22 @@ ANY = 0
 
 @dataclass(slots=True)
 class Context:
-    """State of one client for its handlers. The server updates `now_us` for every message."""
+    """State of one client for its handlers. The server updates `now_us` for every message.
+
+    Events, signing, storage, calibration and radio are the vehicle's, the same for all clients.
+    """
 
     link: Link
-    """Answers and streams of the client that asks, and of nobody else."""
+    """Answers and streams of this client."""
     port: AutopilotPort
     now_us: int
     """Simulated time [µs]."""
     announce: Callable[[Message], None]
-    """Sends a text to the operators, to all clients of all links. And its event, if it is one.
-    Events are part of the telemetry: where an answer to a client must not change that, in lockstep,
+    """Sends a text, with its event if it has one, to all clients of all links. Events are part of the telemetry. Where an answer to a client must not change that, in lockstep,
     it is a text alone."""
     broadcast: Callable[[str, bytes], None]
     """Sends a message, by its name and payload, to all clients of all links."""
     events: EventBuffer
-    """The newest events, the same for all clients."""
     signing: Signing
     """The key of all links, if there is one."""
     system_id: int = SYSTEM_ID
@@ -52,13 +53,11 @@ class Context:
     """Index that a running parameter list sends next; -1 = the hash; None = no list is running."""
     transfer: MissionTransfer = field(default_factory=MissionTransfer)
     storage: Storage = field(default_factory=Storage)
-    """The vehicle's files, the same for all clients."""
     ftp: FtpClient = field(default_factory=FtpClient)
     shell: Shell = field(default_factory=Shell)
     calibration: RunningCalibration = field(default_factory=RunningCalibration)
-    """The vehicle's, the same for all clients."""
     radio: Radio = field(default_factory=Radio)
-    """The newest channels of a radio, the same for all clients."""
+    """Newest channels of a radio."""
     log_listing: LogListing | None = None
     log_download: LogDownload | None = None
     log_stream: LogStream | None = None

@@ -1,7 +1,7 @@
 """Messages on request, and how often they are streamed.
 
 REQUEST_MESSAGE, SET_MESSAGE_INTERVAL, GET_MESSAGE_INTERVAL and their older kin, answered as a
-running PX4 1.16 answers them: a message that has nothing to say is DENIED, the rate of one that is
+running PX4 1.16 answers them. A message that has nothing to say is DENIED, the rate of one that is
 no stream FAILED.
 """
 

@@ -1,7 +1,7 @@
 """Commands to fly somewhere, missions, home, origin, and the region of interest.
 
 Source: PX4 1.16, Commander.cpp and Navigator, checked against a running one. PX4 does not look
-at the frame: every altitude is above mean sea level. MAVSDK relies on it, whose do_orbit sends such
+at the frame. Every altitude is above mean sea level. MAVSDK relies on it, whose do_orbit sends such
 an altitude in a frame above home.
 """
 
