@@ -106,6 +106,11 @@ def quantity(
     )
 
 
+def optional(description: str) -> Any:
+    """Declare a field that is None unless it is given."""
+    return Field(default=None, description=description)
+
+
 def later_field(default: Any, description: str | None = None) -> Any:
     """Declare a field that came later than digests and cards of such models.
 

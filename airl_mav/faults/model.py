@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import Field, field_validator, model_validator
 
 from airl_mav.core.errors import FieldError
-from airl_mav.core.fields import ProfileModel, quantity
+from airl_mav.core.fields import ProfileModel, optional, quantity
 from airl_mav.faults.kinds import KINDS, LINKS, Kind, Part, Phase, fault_text, kinds_of, read_fault
 
 LONGEST_S = 100_000.0
@@ -26,10 +26,9 @@ class Fault(ProfileModel):
     value: tuple[float, ...] = Field(
         default=(), description="how much, in the unit of the kind: one number, or three"
     )
-    phase: Phase | None = Field(
-        default=None,
-        description="phase of the flight that sets it off when it begins for the first time; by"
-        " default the start of the episode",
+    phase: Phase | None = optional(
+        "phase of the flight that sets it off when it begins for the first time; by"
+        " default the start of the episode"
     )
     at_s: float = quantity(
         "simulated time from the start of the episode, or of the phase, until it begins",

@@ -16,7 +16,7 @@ from pydantic import Field, model_validator
 
 from airl_mav.core.constants import G_PER_KG
 from airl_mav.core.errors import UsageError
-from airl_mav.core.fields import ProfileModel, later_field, quantity
+from airl_mav.core.fields import ProfileModel, later_field, optional, quantity
 from airl_mav.core.files import replace_file
 from airl_mav.profiles.loading import load_profile, profiles_dir
 
@@ -66,9 +66,8 @@ class Latency(ProfileModel):
     samples_ms: tuple[Annotated[float, Field(gt=0, le=LONGEST_MS)], ...] | None = Field(
         default=None, description="measured latencies", json_schema_extra={"unit": "ms"}
     )
-    samples_file: str | None = Field(
-        default=None,
-        description="text file of measured latencies beside the profile, one a line in ms",
+    samples_file: str | None = optional(
+        "text file of measured latencies beside the profile, one a line in ms"
     )
 
     @model_validator(mode="after")
@@ -124,8 +123,8 @@ class Workload(ProfileModel):
     """One network on one runtime, as this computer ran it."""
 
     network: Network
-    policy_sha256: str | None = Field(
-        default=None, description="digest of the policy file that was timed, if it was one of ours"
+    policy_sha256: str | None = optional(
+        "digest of the policy file that was timed, if it was one of ours"
     )
     latency: Latency
     source: str = Field(description="where the latency comes from")

@@ -6,7 +6,7 @@ from typing import Any
 
 from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
-from airl_mav.core.fields import ProfileModel, quantity
+from airl_mav.core.fields import ProfileModel, optional, quantity
 
 
 class AutoExposure(ProfileModel):
@@ -72,8 +72,8 @@ class Imaging(ProfileModel):
         le=8,
         default=0.0,
     )
-    auto_exposure: AutoExposure | None = Field(
-        default=None, description="how the gain follows the light; left out: it is `gain`"
+    auto_exposure: AutoExposure | None = optional(
+        "how the gain follows the light; left out: it is `gain`"
     )
     vignetting: float = quantity(
         "share of the light that the farthest corner lacks; it grows with the square of the"

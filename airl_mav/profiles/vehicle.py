@@ -12,7 +12,7 @@ from pydantic import (
 
 from airl_mav.core.constants import C_PER_MAH, GRAVITY_M_S2
 from airl_mav.core.errors import FieldError, UsageError
-from airl_mav.core.fields import ProfileModel, later_field, quantity
+from airl_mav.core.fields import ProfileModel, later_field, optional, quantity
 from airl_mav.core.frames import HOME, Geodetic
 from airl_mav.profiles.camera import Camera, FurtherCameras, check_rates, with_the_rate
 from airl_mav.profiles.loading import load_profile
@@ -257,20 +257,19 @@ class VehicleProfile(ProfileModel):
         " their rate_hz is left out",
     )
     sensors: Sensors
-    estimation: Estimation | None = Field(
-        default=None, description="error of the estimator on these sensors; absent = not known"
+    estimation: Estimation | None = optional(
+        "error of the estimator on these sensors; absent = not known"
     )
-    response: Response | None = Field(
-        default=None,
-        description="how it answers velocity setpoints; absent = not known: its decisions' latency"
-        " cannot be compensated",
+    response: Response | None = optional(
+        "how it answers velocity setpoints; absent = not known: its decisions' latency"
+        " cannot be compensated"
     )
     parameters: ParameterTable = Field(
         default_factory=dict,
         description="PX4-named parameters of the built-in autopilot that differ from the defaults",
     )
-    px4: Px4 | None = Field(default=None, description="for --firmware px4 and px4-hitl")
-    ardupilot: ArduPilot | None = Field(default=None, description="for --firmware ardupilot")
+    px4: Px4 | None = optional("for --firmware px4 and px4-hitl")
+    ardupilot: ArduPilot | None = optional("for --firmware ardupilot")
 
     @model_validator(mode="before")
     @classmethod

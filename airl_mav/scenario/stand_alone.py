@@ -10,7 +10,7 @@ from pydantic import Field
 
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.errors import FieldError
-from airl_mav.core.fields import ProfileModel, quantity
+from airl_mav.core.fields import ProfileModel, optional, quantity
 from airl_mav.core.goals import Goal
 from airl_mav.core.ports import LOOPBACK
 from airl_mav.faults.kinds import PROCESSES
@@ -67,17 +67,15 @@ class StandAloneVehicle(Aircraft):
     seed: int = quantity(
         "seed of arena, sensors, wind and spread", "1", ge=0, le=GREATEST_SEED, default=1
     )
-    speed: float | Literal["max"] | None = Field(
-        default=None,
-        description="simulated seconds per wall second, above 0, at most 100; max: as fast as it"
-        " goes, for clients that do not live by the wall clock; by default 1, in lockstep max",
+    speed: float | Literal["max"] | None = optional(
+        "simulated seconds per wall second, above 0, at most 100; max: as fast as it"
+        " goes, for clients that do not live by the wall clock; by default 1, in lockstep max"
     )
     duration: float | None = quantity(
         "end after this simulated time; by default on Ctrl-C", "s", ge=0, le=1e6, default=None
     )
-    firmware_log: Path | None = Field(
-        default=None,
-        description="with real firmware that is started here: what it prints goes to this file",
+    firmware_log: Path | None = optional(
+        "with real firmware that is started here: what it prints goes to this file"
     )
     bind: str = Field(default=LOOPBACK, description="IPv4 address that links and camera bind")
     companion_host: str = Field(
@@ -118,25 +116,22 @@ class StandAloneVehicle(Aircraft):
         le=3600,
         default=COMPANION_TIMEOUT_S,
     )
-    goal_radius_m: GoalRadius | None = Field(
-        default=None,
-        description="in lockstep: judge the flight, and tell the companion when it is lost; the"
+    goal_radius_m: GoalRadius | None = optional(
+        "in lockstep: judge the flight, and tell the companion when it is lost; the"
         " goal is reached closer than this: seen from above, if it has no height; by default"
-        " nobody judges",
+        " nobody judges"
     )
     time_limit_s: TimeLimit = Field(
         default=TIME_LIMIT_S,
         description="with a goal radius: longest flight from the start of navigation",
     )
-    parameters_file: Path | None = Field(
-        default=None,
-        description="keep the parameters that clients set in this file: read at the start, written"
-        " after every change; QGroundControl loads it, too",
+    parameters_file: Path | None = optional(
+        "keep the parameters that clients set in this file: read at the start, written"
+        " after every change; QGroundControl loads it, too"
     )
-    tlog: Path | None = Field(
-        default=None,
-        description="write the MAVLink log of the onboard link to this file, and the vehicle's log"
-        " (.ulg) beside it",
+    tlog: Path | None = optional(
+        "write the MAVLink log of the onboard link to this file, and the vehicle's log"
+        " (.ulg) beside it"
     )
 
     @property
@@ -176,10 +171,9 @@ class CompanionAddresses(ProfileModel):
 class StandAloneCompanion(CompanionAddresses, Lateness, Decisions):
     """What flies a policy, by itself: on an onboard computer, or against any simulator."""
 
-    signing_key: Path | None = Field(
-        default=None,
-        description="sign MAVLink with the key in this file, that of the flight controller (64"
-        " hexadecimal digits, mode 0600); over udpin:// only",
+    signing_key: Path | None = optional(
+        "sign MAVLink with the key in this file, that of the flight controller (64"
+        " hexadecimal digits, mode 0600); over udpin:// only"
     )
     policy: PolicyName = DEFAULT_POLICY
     goal: Goal = Field(
@@ -229,14 +223,11 @@ class StandAloneCompanion(CompanionAddresses, Lateness, Decisions):
         le=3600,
         default=30.0,
     )
-    log: Path | None = Field(
-        default=None, description="write the stamps of every decision to this .npz file"
-    )
-    black_box: Path | None = Field(
-        default=None,
-        description="record the flight in a new file of this folder, <UTC time>.mcap: decisions,"
+    log: Path | None = optional("write the stamps of every decision to this .npz file")
+    black_box: Path | None = optional(
+        "record the flight in a new file of this folder, <UTC time>.mcap: decisions,"
         " telemetry, images, status and resources; it survives a crash up to its last second, and"
-        " airl report shows it",
+        " airl report shows it"
     )
     tell_obstacles: bool = Field(
         default=False,

@@ -41,7 +41,8 @@ class Context:
     now_us: int
     """Simulated time [µs]."""
     announce: Callable[[Message], None]
-    """Sends a text, with its event if it has one, to all clients of all links. Events are part of the telemetry. Where an answer to a client must not change that, in lockstep,
+    """Sends a text, with its event if it has one, to all clients of all links.
+    Events are part of the telemetry. Where an answer to a client must not change that, in lockstep,
     it is a text alone."""
     broadcast: Callable[[str, bytes], None]
     """Sends a message, by its name and payload, to all clients of all links."""
