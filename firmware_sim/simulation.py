@@ -27,8 +27,7 @@ from firmware_sim.engine.record import FLOWN_TICK, TRUE_TICK
 from firmware_sim.engine.ticks import COLLIDED, FUSE, log_flown_record, log_record
 from firmware_sim.faults.camera import FailingCamera
 from firmware_sim.faults.controller import FailingParts
-from firmware_sim.faults.injection import ClientFaults
-from firmware_sim.faults.timeline import FaultTimeline
+from firmware_sim.faults.timeline import ClientFaults, FaultTimeline
 from firmware_sim.flight_controller import FlightController
 from firmware_sim.hover_start import HoverStart
 from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth

@@ -38,32 +38,11 @@ _SEEDS = 1 << 32
 """Numbers of seeds that Mitsuba tells from each other."""
 
 
-def path_traced(
-    arena: Arena,
-    centers: Floats,
-    intrinsics: Intrinsics,
-    position: Floats,
-    quaternion: Floats,
-    *,
-    samples: int,
-    seed: int = 0,
-) -> NDArray[np.uint8]:
-    """Return the sRGB image of an arena by Mitsuba's path tracer; arguments as of `render.render`.
-
-    `samples` are paths per pixel, approximate off the middle of a cylinder or fisheye.
-
-    Raises:
-        UsageError: The arena has fog.
-        ImportError: Mitsuba is not installed: the extra `render`.
-    """
-    return PathTracer(samples)(arena, centers, intrinsics, position, quaternion, seed)
-
-
 class PathTracer:
     """Draws images, and keeps the scene of the last one for as long as nothing in it moves."""
 
     def __init__(self, samples: int) -> None:
-        """Trace so many paths a pixel."""
+        """Trace so many paths a pixel, about as many off the middle of a cylinder or fisheye."""
         self._samples = samples
         self._arena: Arena | None = None
         self._centers: Floats = np.zeros((0, 3))
@@ -79,7 +58,10 @@ class PathTracer:
         quaternion: Floats,
         seed: int,
     ) -> NDArray[np.uint8]:
-        """Return the image; see `path_traced`."""
+        """Return the sRGB image of an arena; arguments as of `render.render`.
+
+        Raises UsageError for an arena with fog, ImportError without Mitsuba (the extra `render`).
+        """
         if arena.look.light.extinction > 0.0:
             raise UsageError("renderer mitsuba: accepted: an arena without appearance.fog")
         import mitsuba as mi

@@ -111,6 +111,11 @@ def optional(description: str) -> Any:
     return Field(default=None, description=description)
 
 
+def switch(description: str) -> Any:
+    """Declare a switch that is off unless it is given."""
+    return Field(default=False, description=description)
+
+
 def later_field(default: Any, description: str | None = None) -> Any:
     """Declare a field that came later than digests and cards of such models.
 

@@ -16,7 +16,7 @@ from pydantic import Field, Strict, model_validator
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.constants import Level
 from airl_mav.core.errors import UsageError
-from airl_mav.core.fields import ProfileModel, optional, quantity, validated
+from airl_mav.core.fields import ProfileModel, optional, quantity, switch, validated
 from airl_mav.core.files import read_json
 from airl_mav.policy.action_sets import CONTINUOUS, ActionSpec
 from airl_mav.policy.action_sets import SHIPPED as SHIPPED_ACTION_SETS
@@ -176,9 +176,7 @@ class PolicyFacts(ProfileModel):
     decisions: DecisionTiming = Field(
         default="sequential", description="when a decision begins; see airl_mav.scenario.model"
     )
-    compensate: bool = Field(
-        default=False, description="it wants its decision latency compensated, as in training"
-    )
+    compensate: bool = switch("it wants its decision latency compensated, as in training")
     algorithm: str = Field(default="", description="what trained it")
     epsilon: float = quantity("share of random actions in flight", "1", ge=0, le=1, default=0.0)
     training: Training = Field(default_factory=Training)

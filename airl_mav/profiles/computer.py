@@ -16,7 +16,7 @@ from pydantic import Field, model_validator
 
 from airl_mav.core.constants import G_PER_KG
 from airl_mav.core.errors import UsageError
-from airl_mav.core.fields import ProfileModel, later_field, optional, quantity
+from airl_mav.core.fields import ProfileModel, later_field, optional, quantity, switch
 from airl_mav.core.files import replace_file
 from airl_mav.profiles.loading import load_profile, profiles_dir
 
@@ -163,9 +163,8 @@ class ComputerProfile(ProfileModel):
         le=100_000,
         default=0.0,
     )
-    ground_equipment: bool = Field(
-        default=False,
-        description="it stays on the ground: neither its mass nor its watts are the aircraft's",
+    ground_equipment: bool = switch(
+        "it stays on the ground: neither its mass nor its watts are the aircraft's"
     )
     price_usd: float = quantity("price", "USD", ge=0, le=1_000_000)
     source: str = Field(description="where the numbers come from")

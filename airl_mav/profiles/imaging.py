@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import SerializerFunctionWrapHandler, model_serializer, model_validator
 
-from airl_mav.core.fields import ProfileModel, optional, quantity
+from airl_mav.core.fields import ProfileModel, optional, quantity, switch
 
 
 class AutoExposure(ProfileModel):
@@ -98,10 +98,9 @@ class Imaging(ProfileModel):
         le=10_000,
         default=0.0,
     )
-    bayer: bool = Field(
-        default=False,
-        description="whether each pixel measures one colour (mosaic RGGB) and the others are"
-        " interpolated bilinearly; only of kind rgb",
+    bayer: bool = switch(
+        "whether each pixel measures one colour (mosaic RGGB) and the others are"
+        " interpolated bilinearly; only of kind rgb"
     )
     jpeg_quality: int | None = quantity(
         "images are compressed as JPEG of this quality, by libjpeg's scale; left out: they are not",

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from airl_mav.core.fields import ProfileModel, optional, quantity
+from airl_mav.core.fields import ProfileModel, optional, quantity, switch
 from airl_mav.faults.model import Fault
 from airl_mav.profiles.camera_kind import Renderer
 from airl_mav.profiles.conditions import Payload, SensorNoise, Spread, WindSettings
@@ -81,18 +81,13 @@ class RealFirmware(ProfileModel):
         "with firmware px4: start this PX4 for every flight; a SITL build, its source"
         " tree, or an unpacked package"
     )
-    px4_connect: bool = Field(
-        default=False,
-        description="with firmware px4: wait for a PX4 that you start for every flight",
-    )
+    px4_connect: bool = switch("with firmware px4: wait for a PX4 that you start for every flight")
     ardupilot_dir: Path | None = optional(
         "with firmware ardupilot: start this ArduCopter for every flight; a SITL build,"
         " its source tree, or the program itself"
     )
-    ardupilot_connect: bool = Field(
-        default=False,
-        description="with firmware ardupilot: wait for an ArduCopter that you start for every"
-        " flight",
+    ardupilot_connect: bool = switch(
+        "with firmware ardupilot: wait for an ArduCopter that you start for every flight"
     )
     instance: int = quantity(
         "instance number: moves all ports of the flight controller and that of the camera, as PX4's"

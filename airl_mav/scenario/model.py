@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, ModelWrapValidatorHandler, ValidationError, model_validator
 
 from airl_mav.core.constants import CommandKind
-from airl_mav.core.fields import ProfileModel, field_error, optional, quantity
+from airl_mav.core.fields import ProfileModel, field_error, optional, quantity, switch
 from airl_mav.flight.judge import TIME_LIMIT_S, GoalRadius, TimeLimit
 from airl_mav.policy.actions import UPRIGHT_S, DecisionTiming
 from airl_mav.scenario.aircraft import FREE, NO_TWIN, Aircraft
@@ -180,10 +180,9 @@ class Inference(ProfileModel):
         default="onnx", description="what runs a learned policy; torch needs its policy.pt2"
     )
     threads: int = quantity("threads of one inference", "1", ge=1, le=64, default=1)
-    trust: bool = Field(
-        default=False,
-        description="run policy.pt2, or code that the card names, of a folder that is not shipped:"
-        " both execute what its author wrote",
+    trust: bool = switch(
+        "run policy.pt2, or code that the card names, of a folder that is not shipped:"
+        " both execute what its author wrote"
     )
 
 
@@ -348,10 +347,8 @@ class Flights(Workers):
         le=GREATEST_SLOTS,
         default=128,
     )
-    tlogs: Annotated[bool, FREE] = Field(
-        default=False,
-        description="level lockstep: write the logs of every flight (.tlog, .ulg); level sitl"
-        " always does",
+    tlogs: Annotated[bool, FREE] = switch(
+        "level lockstep: write the logs of every flight (.tlog, .ulg); level sitl always does"
     )
 
 

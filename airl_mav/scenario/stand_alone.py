@@ -10,7 +10,7 @@ from pydantic import Field
 
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.errors import FieldError
-from airl_mav.core.fields import ProfileModel, optional, quantity
+from airl_mav.core.fields import ProfileModel, optional, quantity, switch
 from airl_mav.core.goals import Goal
 from airl_mav.core.ports import LOOPBACK
 from airl_mav.faults.kinds import PROCESSES
@@ -82,17 +82,15 @@ class StandAloneVehicle(Aircraft):
         default=LOOPBACK, description="IPv4 address of the companion computer"
     )
     gcs_host: str = Field(default=LOOPBACK, description="IPv4 address of the ground station")
-    insecure: bool = Field(
-        default=False,
-        description="allow addresses that other machines can reach without a signing key: MAVLink"
-        " has no other authentication",
+    insecure: bool = switch(
+        "allow addresses that other machines can reach without a signing key: MAVLink"
+        " has no other authentication"
     )
-    lockstep: bool = Field(
-        default=False,
-        description="simulated time waits for one companion that passes turns (airl-companion"
+    lockstep: bool = switch(
+        "simulated time waits for one companion that passes turns (airl-companion"
         " --lockstep, or any program that keeps to docs/reference/lockstep-protocol.md): the same"
         " flight every time, bit by bit; there is no ground station then, and the companion's end"
-        " ends the flight",
+        " ends the flight"
     )
     transport_ms: float = quantity(
         "in lockstep: from a frame's exposure until the companion sees it",
@@ -192,15 +190,13 @@ class StandAloneCompanion(CompanionAddresses, Lateness, Decisions):
         description="vehicle profile: its response to setpoints and its camera's mount are what"
         " compensation reckons with",
     )
-    check: bool = Field(
-        default=False,
-        description="look at camera, flight controller and policy on the ground, say what is wrong,"
-        " and end: nothing is armed, no setpoint is sent",
+    check: bool = switch(
+        "look at camera, flight controller and policy on the ground, say what is wrong,"
+        " and end: nothing is armed, no setpoint is sent"
     )
-    lockstep: bool = Field(
-        default=False,
-        description="take turns with a simulator that waits for this program (airl-firmware"
-        " --lockstep): every flight of a seed is the same",
+    lockstep: bool = switch(
+        "take turns with a simulator that waits for this program (airl-firmware"
+        " --lockstep): every flight of a seed is the same"
     )
     speed: float = quantity(
         "simulated seconds per wall second of the simulator; 1 on a real aircraft",
@@ -229,11 +225,10 @@ class StandAloneCompanion(CompanionAddresses, Lateness, Decisions):
         " telemetry, images, status and resources; it survives a crash up to its last second, and"
         " airl report shows it"
     )
-    tell_obstacles: bool = Field(
-        default=False,
-        description="send OBSTACLE_DISTANCE from the depth camera, ten times a second, for the"
+    tell_obstacles: bool = switch(
+        "send OBSTACLE_DISTANCE from the depth camera, ten times a second, for the"
         " flight controller's collision prevention (CP_DIST), which holds back a pilot in Position"
-        " mode",
+        " mode"
     )
     black_box_images_hz: float = quantity(
         "most images that the black box keeps, each one that a decision saw",

@@ -13,7 +13,7 @@ from pydantic import Field
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError
-from airl_mav.core.fields import optional, quantity, validated
+from airl_mav.core.fields import optional, quantity, switch, validated
 from airl_mav.core.progress import Bar, Progress
 from airl_mav.experiments.executors import Executor, ExecutorSettings, Stop, WorkerError, never
 from airl_mav.experiments.store import open_campaign
@@ -66,10 +66,9 @@ class SweepRequest(Workers):
         le=8,
         default=None,
     )
-    dry_run: bool = Field(
-        default=False,
-        description="say what would be done: trials, parameters, multiply-accumulates, decisions;"
-        " nothing is trained or written",
+    dry_run: bool = switch(
+        "say what would be done: trials, parameters, multiply-accumulates, decisions;"
+        " nothing is trained or written"
     )
 
     @property

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, get_args
 from pydantic import Field, field_validator, model_validator
 
 from airl_mav.core.errors import FieldError
-from airl_mav.core.fields import ProfileModel, optional, quantity, validated
+from airl_mav.core.fields import ProfileModel, optional, quantity, switch, validated
 from airl_mav.core.plugins import NETWORKS, part_name
 from airl_mav.envs.spec import EnvironmentSpec, ExpertName
 from airl_mav.policy.action_sets import SHIPPED, ActionSpec, discrete_actions
@@ -225,9 +225,8 @@ class TrainingConfig(ProfileModel):
     checkpoint_every: int = quantity(
         "steps between checkpoints", "1", ge=1, le=10**9, default=20_000
     )
-    keep_zones: bool = Field(
-        default=False,
-        description="keep a checkpoint and the weights with which each curriculum zone was done",
+    keep_zones: bool = switch(
+        "keep a checkpoint and the weights with which each curriculum zone was done"
     )
     environment: EnvironmentSpec = Field(default_factory=EnvironmentSpec, description="environment")
     network: NetworkSpec = Field(default_factory=NetworkSpec, description="network")

@@ -15,7 +15,7 @@ from torch import nn
 
 from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import FieldError
-from airl_mav.core.fields import optional, validated
+from airl_mav.core.fields import optional, switch, validated
 from airl_mav.core.plugins import names_code
 from airl_mav.core.provenance import package_versions
 from airl_mav.envs.sight import further_seen
@@ -214,12 +214,9 @@ class ExportRequest(BaseModel):
         default=0.0,
         description="share of random actions in flight, 0 to 1; discrete action sets only",
     )
-    with_torch: bool = Field(
-        default=False, description="also write policy.pt2, for the torch runtime"
-    )
-    int8: bool = Field(
-        default=False,
-        description="write a network in 8-bit integers, calibrated with frames of its own flights",
+    with_torch: bool = switch("also write policy.pt2, for the torch runtime")
+    int8: bool = switch(
+        "write a network in 8-bit integers, calibrated with frames of its own flights"
     )
 
     @property

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from pydantic import BaseModel, Field
 
 from airl_mav.core.errors import FieldError, UsageError
-from airl_mav.core.fields import optional
+from airl_mav.core.fields import optional, switch
 from airl_mav.profiles.loading import load_profile
 
 if TYPE_CHECKING:
@@ -51,10 +51,8 @@ class TrainRequest(BaseModel):
         " the configuration's, or with fresh ones"
     )
     name: str | None = optional("name of the policy on its card; by default the configuration's")
-    resume: bool = Field(
-        default=False,
-        description="continue the run in --out from its newest checkpoint; start it if there is"
-        " none",
+    resume: bool = switch(
+        "continue the run in --out from its newest checkpoint; start it if there is none"
     )
 
     @property

@@ -1,4 +1,4 @@
-"""Faults of an episode that act now, and that have acted."""
+"""Faults of an episode that act now, and that have acted; those of clients among them."""
 
 from __future__ import annotations
 
@@ -153,3 +153,26 @@ class FaultTimeline:
         begin_us, end_us = self._acting[index]
         until_us = end_us if end_us == FOREVER_US else self._start_us + end_us
         return Acting(index, self._faults[index], self._start_us + begin_us, until_us)
+
+
+class ClientFaults:
+    """Puts what clients inject among the faults of an episode. Implements `port.Failures`."""
+
+    def __init__(self, timeline: Callable[[], FaultTimeline]) -> None:
+        """Take what returns the faults of the episode, at the present time.
+
+        It is asked first when something is injected. Until then nothing lies between the plant and
+        the flight controller.
+        """
+        self._timeline = timeline
+        self._injected = False
+
+    def inject(self, fault: Fault) -> None:
+        """Let a part fail from now on."""
+        self._injected = True
+        self._timeline().inject(fault)
+
+    def clear(self, part: Part) -> None:
+        """End all that acts on a part."""
+        if self._injected:
+            self._timeline().clear(part)

@@ -24,8 +24,8 @@ from airl_mav.rehearsal.run_folder import RunFolder
 from airl_mav.scenario.aircraft import Aircraft
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
+from firmware_sim.faults.controller import gust_at
 from firmware_sim.faults.timeline import Acting
-from firmware_sim.faults.wind import gust_at
 from tests.learning.test_fleet import ENDLESS, OPEN, VEHICLE, PlantPilot, command
 
 FORWARD = np.array([[2.0, 0.0, 0.3]])

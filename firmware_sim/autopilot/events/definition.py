@@ -14,9 +14,6 @@ from typing import NamedTuple
 
 from firmware_sim.autopilot.events.enumerations import ENUMERATIONS
 
-MAX_ARGUMENT_BYTES = 25
-"""PX4's limit for the arguments of an event."""
-
 _AUTOPILOT = 1
 """Component id in the uppermost byte of an event's id."""
 _FNV_BASIS, _FNV_PRIME = 0x811C9DC5, 0x01000193
