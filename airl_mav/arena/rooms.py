@@ -94,10 +94,7 @@ class Plan:
 def draw_plan(
     rng: np.random.Generator, spec: ArenaSpec, bounds: Bounds, keep_off: Boxes, name: str
 ) -> Plan:
-    """Draw the rooms of an arena within bounds, without walls in `keep_off`.
-
-    Raises UsageError: no such plan was found.
-    """
+    """Draw rooms within bounds, without walls in `keep_off`. Raises UsageError if none fits."""
     rooms, width_m = spec.rooms, spec.rooms.corridor_width_m
     count = int(rng.integers(*rooms.count, endpoint=True))
     floor = Rect((bounds.north_min, bounds.east_min), (bounds.north_max, bounds.east_max))

@@ -340,10 +340,7 @@ def placed_in(
     n_obstacles: int,
     clear: NDArray[np.bool_] | None = None,
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32], NDArray[np.float64]]:
-    """Return `owner`, `first`, `root` and `pose` of `Meshes`, with hills if in `roots`.
-
-    `clear` as of `meshes_of`; depth ends on meshes of glass.
-    """
+    """Return `owner`, `first`, `root` and `pose` of `Meshes`, with hills if in `roots`."""
     owner = np.full(n_obstacles, -1, np.int32)
     if clear is not None:
         owner[clear] = UNSEEN

@@ -307,10 +307,7 @@ def _through(
 
 @borrowing_kernel
 def _span_of(boxes: NDArray[np.float32], node: int, at: Vec, inverse: Vec) -> tuple[float, float]:
-    """Return where a ray from `at`, of component inverses, enters and leaves a node's box.
-
-    It misses the box if it leaves first.
-    """
+    """Return where a ray enters and leaves a node's box; it misses if it leaves first."""
     i0, i1, i2 = inverse
     a, b, c = (
         (boxes[node, 0] - at[0]) * i0,

@@ -77,10 +77,7 @@ def render_picture(
     quaternion: Quat | NDArray[np.float64],
     gain: float = 1.0,
 ) -> Picture:
-    """Return the colour image, unlimited depth and what is seen; arguments as of `render`.
-
-    All light is multiplied by `gain` before quantization.
-    """
+    """Return the picture of an arena, light times `gain`; arguments as of `render`."""
     k, obstacles, look = intrinsics, arena.obstacles, ColourArrays.of(arena.look)
     shape = (k.height, k.width)
     # Tuples and arrays of the types that the batch twin hands over: one compiled kernel for both.

@@ -149,10 +149,7 @@ class Shaded(NamedTuple):
 def shade_by_obstacle(
     image: Shaded, optics: Optics, body: Body, to_sun: Vec, through: np.float32
 ) -> None:
-    """Put the points that an obstacle hides from the sun into shadow: `lit` times `through`.
-
-    `to_sun` (3,) is a unit vector NED.
-    """
+    """Multiply `lit` by `through` where an obstacle hides the sun (unit vector NED)."""
     lit, far, ids, corners = image
     lines, xs, bent, view = optics.lines, optics.xs, optics.bent, optics.lens
     shape, half, world = body.shape, body.half, body.pose

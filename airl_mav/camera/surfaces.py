@@ -259,10 +259,7 @@ def shade_meshes(
     meshes: Meshes,
     faces: Faces,
 ) -> None:
-    """Shade the visible flat triangles of meshes, with a pattern along the nearest mesh axis.
-
-    `rectangles` and `faces` (n,) are as of `raycast.draw_bodies`.
-    """
+    """Shade the visible flat triangles of meshes, with a pattern along the nearest mesh axis."""
     for k in range(len(meshes.first)):
         rectangle = rectangles[len(meshes.owner) + k, 0]
         _shade_mesh(canvas, look, optics, rectangle, meshes, k, faces)

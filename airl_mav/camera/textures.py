@@ -29,10 +29,7 @@ LEAST_PX, MOST_PX = 2, 4096
 
 @lru_cache(maxsize=2 * MOST_IMAGES)
 def texels_of(file: ImageFile, side: int) -> Floats:
-    """Return a picture (side, side, 3) in linear RGB 0..1, area-averaged or interpolated; cached.
-
-    Raises UsageError if it cannot be read, has changed, or cannot be a texture.
-    """
+    """Return a picture (side, side, 3) in linear RGB 0..1, resized; cached. Raises UsageError."""
     # Imported here: who flies without a simulation has no pictures to read.
     from PIL import Image
 

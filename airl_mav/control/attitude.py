@@ -89,10 +89,7 @@ def _shortest(a: Vec, b: Vec) -> Quat:
 
 @kernel
 def rate_setpoint(q: Quat, q_sp: Quat, yaw_rate_ff: float, gains: Gains) -> Vec:
-    """Return the body rates FRD [rad/s] that turn attitude q (body -> NED) into q_sp.
-
-    `yaw_rate_ff` is a heading rate about the world's down axis [rad/s].
-    """
+    """Return the body rates FRD [rad/s] from attitude q to q_sp, heading rate fed forward."""
     reduced, half_turn = reduced_attitude(q, q_sp)
     return rates_towards(q, reduced, weighted_turn(half_turn, gains), yaw_rate_ff, gains)
 

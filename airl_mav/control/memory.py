@@ -109,10 +109,7 @@ def trim_for_hover(
 
 
 def trim_against_torque(memory: Memory, motors: Motors, gains: Gains) -> None:
-    """Set the integrals of roll and pitch to their steady values in a hover.
-
-    `motors` are the commands 0..1 of that hover. Equal ones need no torque.
-    """
+    """Set the integrals of roll and pitch to their steady values in a hover at commands 0..1."""
     axes = (
         (ROLL, gains.mix_roll, gains.rate_int_max_roll),
         (PITCH, gains.mix_pitch, gains.rate_int_max_pitch),

@@ -132,10 +132,7 @@ class ChildProcess:
             suspension.end()
 
     def stop(self) -> None:
-        """Close its pipe, wait, then terminate, then kill. Returns when it is gone.
-
-        Harmless when called again.
-        """
+        """Close its pipe, wait, terminate, kill; return when it is gone. Harmless if repeated."""
         self.resume()
         if self.stdin is not None:
             with suppress(BrokenPipeError):

@@ -128,8 +128,5 @@ def since_1970_us(timestamp: str) -> int:
 
 
 def utc_us() -> int:
-    """Return the calendar time since 1970 [µs], for stamps that a driver took from it.
-
-    It may jump, so nothing waits by it.
-    """
+    """Return the calendar time since 1970 [µs], for stamps. It may jump: nothing waits by it."""
     return time.time_ns() // NS_PER_US

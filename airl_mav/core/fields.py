@@ -211,11 +211,7 @@ def _branch_marks(annotation: Any) -> list[Any]:
 
 
 def validated(model: type[Model], data: object, source: object = None) -> Model:
-    """Return data as a model; `source` is its file or options, for messages.
-
-    Raises UsageError if a field is missing, unknown, of the wrong type or out of range. A
-    `FieldError` where there is no source to name.
-    """
+    """Return data as a model. Raises UsageError naming `source`; without it the `FieldError`."""
     try:
         return model.model_validate(data)
     except ValidationError as error:

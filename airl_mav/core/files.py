@@ -53,10 +53,7 @@ def replace_file(path: Path, data: bytes) -> None:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yield the temporary name of a file. On leaving it takes the place of `path`.
-
-    Raises OSError as `replace_file`.
-    """
+    """Yield the temporary name of a file, which then replaces `path`. Raises as `replace_file`."""
     partial = path.with_name(path.name + ".partial")
     try:
         with naming(path):
@@ -310,10 +307,7 @@ def add_arrays(path: Path, groups: Mapping[str, Mapping[str, NDArray[Any]]]) -> 
 
 
 def read_groups(path: Path) -> dict[str, ArrayGroup]:
-    """Return all groups of arrays of an archive; none when there is no file.
-
-    Raises UsageError if it cannot be read or is damaged.
-    """
+    """Return all groups of arrays of an archive, none without a file. Raises UsageError."""
     if not path.exists():
         return {}
     try:

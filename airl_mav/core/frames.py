@@ -113,10 +113,7 @@ def quats_to_euler(q: Vector) -> tuple[Vector, Vector, Vector]:
 
 
 def down_in_body(roll: Vector, pitch: Vector) -> Vector:
-    """Return where down is (..., 3), in body axes FRD, of vehicles with roll and pitch (...) [rad].
-
-    The last row of the rotation matrix body -> NED.
-    """
+    """Return down (..., 3) in body axes FRD at roll and pitch (...) [rad]."""
     level = np.cos(pitch)
     return np.stack([-np.sin(pitch), np.sin(roll) * level, np.cos(roll) * level], axis=-1)
 

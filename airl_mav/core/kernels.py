@@ -123,10 +123,7 @@ def kernel(function: F) -> F:
 
 
 def large_kernel(function: F) -> F:
-    """Compile a function with numba, called and not inlined.
-
-    For what is long and rarely needed: inlined, it would be compiled again with each caller.
-    """
+    """Compile a function with numba, not inlined: it is long, and rarely needed."""
     return _compiled(function, forceinline=False)
 
 

@@ -24,10 +24,7 @@ class LogFile:
     """
 
     def __init__(self, path: Path, on_lost: Callable[[str], None] = lambda _: None) -> None:
-        """Open the file of this final name. Raises OSError.
-
-        `on_lost` is called once, with file and reason, when it cannot be written any more.
-        """
+        """Open the file, or raise OSError. `on_lost` is called once if writing fails."""
         self.path = path
         self.on_lost = on_lost
         self.lost = False

@@ -129,10 +129,7 @@ def load_part(door: Door, name: str, fits: Callable[[Any], bool] = callable) -> 
 
 
 def digest_of(found: str) -> str | None:
-    """Return the SHA-256 of the file that a FILE.py:NAME or MODULE:NAME lies in; None: in no file.
-
-    Raises OSError if it cannot be read.
-    """
+    """Return the SHA-256 of the file of a part; None: it is in no file. Raises OSError."""
     where = found.rpartition(":")[0]
     file: str | None = where
     if not names_file(found):

@@ -51,10 +51,7 @@ class PowerSource(Protocol):
         ...
 
     def take_j(self, elapsed_s: float) -> float | None:
-        """Return the energy since the call before, `elapsed_s` ago, or since the start [J].
-
-        None: unreadable.
-        """
+        """Return the energy of the last `elapsed_s`, since the call before [J]."""
         ...
 
 

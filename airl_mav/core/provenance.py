@@ -90,10 +90,7 @@ def _cpu_model() -> str:
 
 
 def git_state(checkout: Path | None = None) -> dict[str, Any] | None:
-    """Return `commit` and `changed` of a source checkout, by default this package's.
-
-    None without a checkout or git.
-    """
+    """Return `commit` and `changed` of a checkout, by default this package's; None without git."""
     root = checkout or Path(__file__).resolve().parents[2]
     git = shutil.which("git")
     if git is None or not (root / ".git").exists():

@@ -182,10 +182,7 @@ SAVE_EVERY_US = 60 * US_PER_S
 
 
 def read_key(path: Path) -> bytes:
-    """Return the 32 bytes that a file holds as 64 hexadecimal digits.
-
-    Raises FieldError if the file is missing, others may read it, or it holds no key.
-    """
+    """Return the 32 bytes of a file of hexadecimal digits, or raise FieldError."""
     try:
         mode = path.stat().st_mode
         text = path.read_text(encoding="ascii", errors="replace")
@@ -219,11 +216,7 @@ class StoredSigning:
     """A `Signing` whose key and newest time stamp outlive the program."""
 
     def __init__(self, path: Path | None, clock: Clock | None = None) -> None:
-        """Read both; without a path there is no key at first, and nothing is stored.
-
-        `clock` is wall time, for how often the time stamp is written. Raises FieldError as
-        `read_key`.
-        """
+        """Read both, or raise FieldError; without a path there is no key, and nothing is stored."""
         self._path = path
         self._clock = clock or WallClock()
         self.signing = Signing(calendar_us)

@@ -306,10 +306,7 @@ _MS_PER_S = 1000.0
 
 
 def read_fault(text: str) -> dict[str, Any]:
-    """Return the fields of a fault that is written in words.
-
-    Raises ValueError if it cannot be read; one line that says where, and what is accepted.
-    """
+    """Return the fields of a fault in words. Raises ValueError with place and accepted words."""
     words = text.split()
     if len(words) > 1 and words[0] == "motor" and f"motor{words[1]}" in MOTORS:
         words = [f"motor{words[1]}", *words[2:]]

@@ -32,11 +32,7 @@ def window_us(fault: Fault, entered_us: Mapping[str, int]) -> tuple[int, int] | 
 def active(
     faults: Sequence[Fault], time_us: int, entered_us: Mapping[str, int]
 ) -> dict[int, tuple[int, int]]:
-    """Return the faults that act at a time [µs since the start of the episode].
-
-    Returns:
-        From when to when each of them acts, by its index; see `window_us`.
-    """
+    """Return begin and end of the faults that act at a time, by index; see `window_us`."""
     windows = ((i, window_us(fault, entered_us)) for i, fault in enumerate(faults))
     return {i: at for i, at in windows if at is not None and at[0] <= time_us < at[1]}
 

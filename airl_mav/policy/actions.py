@@ -108,10 +108,7 @@ def fastest_climb(speed_m_s: float) -> float:
 
 
 def vertical_speed(altitude_m: float, down_m: float) -> float:
-    """Return the downward speed [m/s] that holds a height above the start [m].
-
-    `down_m` is the present position, down of the start [m].
-    """
+    """Return the downward speed [m/s] that holds a height above the start [m], from a position."""
     return float(vertical_speeds(altitude_m, np.array(down_m)))
 
 
@@ -135,10 +132,7 @@ class Policy(Protocol):
 
 
 def command_kind(policy: object) -> CommandKind:
-    """Return what a policy, or the class of one, commands.
-
-    Raises FieldError when it says anything else.
-    """
+    """Return what a policy, or its class, commands. Raises FieldError if it says anything else."""
     kind = getattr(policy, "commands", "velocity")
     for known in KINDS:
         if kind == known:

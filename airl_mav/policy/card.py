@@ -238,10 +238,7 @@ def digest(data: bytes) -> str:
 
 
 def read_card(folder: Path) -> PolicyCard:
-    """Read the card of a policy without a look at the policy itself.
-
-    Raises UsageError if there is none, or it has a field that is missing, unknown or out of range.
-    """
+    """Read the card of a policy, not the policy itself. Raises UsageError."""
     path = folder / CARD_FILE
     data = read_json(path, SCHEMA, "policy")
     del data["schema"]

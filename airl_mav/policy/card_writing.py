@@ -45,10 +45,7 @@ def write_model_card(folder: Path, card: PolicyCard) -> None:
 
 
 def add_result(folder: Path, result: MeasuredResult) -> PolicyCard:
-    """Write a result onto a card, in place of an earlier one of the same arena, level and latency.
-
-    Raises UsageError: see `read_card`.
-    """
+    """Write a result onto a card, in place of that of the same arena, level and latency."""
     card = read_card(folder)
     others = [each for each in card.results if _conditions(each) != _conditions(result)]
     results = tuple(sorted([*others, result], key=_conditions))

@@ -66,10 +66,7 @@ STRIP_HALF_WIDTH = 1
 
 
 def boxes(spec: ObservationSpec) -> dict[str, Box]:
-    """Return the arrays of a layout, by key.
-
-    Raises UsageError if a layout of the user's has others than a network can take.
-    """
+    """Return the arrays of a layout, by key. Raises UsageError if a network cannot take them."""
     if spec.layout not in SHIPPED:
         return own_boxes(spec)
     found = {
@@ -236,10 +233,7 @@ def _part(name: Told, seen: Observation) -> NDArray[np.float64]:
 
 
 def newest_frame(spec: ObservationSpec, seen: Mapping[str, NDArray[Any]]) -> NDArray[np.uint8]:
-    """Return a copy of the newest frame of one vehicle's arrays, as a picture (h, w) or (h, w, 3).
-
-    A scan is as high as the camera's image would be.
-    """
+    """Return a copy of one vehicle's newest frame, as a picture (h, w) or (h, w, 3)."""
     channels = seen[spec.kind][: CHANNELS[spec.kind]]
     if spec.layout == "scan":
         scan = channels[:, :1, spec.seam : spec.seam + spec.width_px]

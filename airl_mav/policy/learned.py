@@ -120,10 +120,10 @@ class LearnedPolicy:
         return decide(self.card.actions, self.outputs(encoded), self.card.epsilon, rng or self._rng)
 
     def outputs(self, encoded: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
-        """Return the network's outputs (n, k): a score for each discrete action, or the action.
+        """Return a score (n, k) for each discrete action, or the action, of n flights.
 
-        A network with a memory remembers the call as a decision. Raises ValueError if it remembers
-        another number of flights.
+        A network with a memory remembers the call as a decision. ValueError: it remembers other
+        flights.
         """
         if self._ablate is not None:
             encoded = ablated(encoded, self._ablate)

@@ -174,10 +174,7 @@ def encode(frame: Frame, state: Kinematics, goal: Goal) -> Observation:
 
 
 def views_of(frame: Frame, earlier: Sequence[Mapping[str, NDArray[Any]]] = ()) -> dict[str, View]:
-    """Return what the further cameras of a frame show.
-
-    `earlier` are the images of the decisions before by camera, the newest first.
-    """
+    """Return the further cameras' views of a frame; `earlier` images are the newest first."""
     return {
         name: View(each.image, each.intrinsics, tuple(then[name] for then in earlier))
         for name, each in frame.further.items()

@@ -151,10 +151,7 @@ def _shipped() -> list[str]:
 
 
 def _folder(name: str) -> Path | None:
-    """Return the folder of a policy; None for one that an installed package announces.
-
-    Raises UsageError: neither.
-    """
+    """Return the folder of a policy; None for one of an installed package. Raises UsageError."""
     if name in _shipped():
         return profiles_dir() / "policies" / name
     path = Path(name)

@@ -157,10 +157,7 @@ NUMPY_SCANNING = Scanning(level_scan, carried)
 def scans_of(
     seen: Observation, frames: int, bearings: int, make: Scanning = NUMPY_SCANNING
 ) -> Floats:
-    """Return the scans (n, frames, bearings) of n vehicles, all from their present place [m].
-
-    The newest, of this decision, comes first; infinite: nothing, or no frame yet.
-    """
+    """Return scans (n, frames, bearings) of n vehicles from here, the newest first [m]."""
     rays, now = rays_of(seen.intrinsics), seen.states[0]
     scans = np.full((len(seen.goal), frames, bearings), np.inf)
     images = (seen.depth_mm, *seen.earlier_mm)[:frames]

@@ -105,10 +105,7 @@ def check_plant(asked: Aircraft) -> None:
 
 
 def check_ports(ports: Ports, *, any_camera: bool) -> None:
-    """Raise FieldError for a port that no client could be told, or two links on one port.
-
-    The camera's port may be 0, any free one, if `any_camera`.
-    """
+    """Raise FieldError for an unusable port, or two links on one; 0, if `any_camera`, is free."""
     for field in ("api_port", "gcs_port", *(() if any_camera else ("camera_port",))):
         if getattr(ports, field) == 0:
             raise FieldError(f"ports.{field}", 0, "1 <= value <= 65535")

@@ -36,10 +36,7 @@ def flight_plan(vehicle: VehicleProfile, plant: PlantName) -> CompilePlan:
 
 
 def vectorized_plan(kind: CameraKind, *, recorded: bool) -> CompilePlan:
-    """Return the kernels of level gym, whose flights are recorded, or of a training.
-
-    `kind` is that of the main camera's images.
-    """
+    """Return the kernels of level gym, whose flights are recorded, or of a training."""
     how = {"recorded": recorded}
     return CompilePlan(
         "vectorized",

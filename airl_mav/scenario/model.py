@@ -93,10 +93,7 @@ class WatchdogSettings(ProfileModel):
         hold_s: float = 0.0,
         on_card: float | None = None,
     ) -> float:
-        """Return the time-out of a decision [s]: as configured, as on the card, or by default.
-
-        Actions are held for `hold_s`.
-        """
+        """Return the time-out of a decision [s]: as configured, as on the card, or by default."""
         if self.decision_timeout_s is not None:
             return self.decision_timeout_s
         if on_card is not None:

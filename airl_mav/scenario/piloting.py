@@ -121,10 +121,7 @@ def check_compensated(pilot: PilotSettings, policy: PolicyInfo, vehicle: Vehicle
 
 
 def check_goal_height(policy: PolicyInfo, goal: Goal, field: str, asked: object) -> None:
-    """Raise FieldError for a policy that takes the goal's height, and a goal without one.
-
-    `field` and `asked` say where the goal is set, and its value.
-    """
+    """Raise FieldError, of `field`, for a policy that takes a height, and a goal without one."""
     if policy.card is not None and policy.card.observation.goal_height and len(goal) == 2:
         raise FieldError(
             field,
@@ -163,11 +160,7 @@ def select_latency(asked: Lateness, policy: PolicyInfo, *, on_this_computer: boo
 
 
 def load_asked_policy(asked: Decisions, policy: PolicyInfo, hold_s: float, seed: int) -> Policy:
-    """Return the policy, ready to decide with the configured runtime, threads, ablation and trust.
-
-    Its actions are held for `hold_s`; `seed` is that of its random actions. Raises UsageError if it
-    cannot be run so.
-    """
+    """Return the policy, ready to decide as configured, or raise UsageError."""
     return load_policy(
         policy,
         hold_s,

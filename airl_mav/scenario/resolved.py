@@ -245,19 +245,13 @@ class ResolvedScenario:
         return sampler if native else sampler or FixedSampler(NATIVE_T2_US)
 
     def compensator(self) -> Compensator | None:
-        """Return what carries forward what a companion sees, or None where nothing does.
-
-        Raises FieldError for a vehicle whose response is not known.
-        """
+        """Return the compensator of a companion, None without one. Raises FieldError."""
         if not self.pilot.compensate:
             return None
         return Compensator(1, self.vehicle, Intrinsics.of(self.vehicle.camera))
 
     def fresh_policy(self, seed: int) -> Policy:
-        """Return the policy as it begins the flight of a seed: it remembers nothing.
-
-        Raises UsageError if it cannot be run as asked.
-        """
+        """Return the policy at the start of a seed's flight, or raise UsageError."""
         loaded = self._loaded_policy
         if isinstance(loaded, LearnedPolicy):
             return loaded.with_generator(action_generator(seed))

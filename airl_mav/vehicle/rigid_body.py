@@ -73,10 +73,7 @@ def step(
     airframe: Airframe,
     dt: float,
 ) -> tuple[Vec, Vec, Quat, Vec]:
-    """Advance position, velocity, attitude and angular velocity FRD of a free body by dt [s].
-
-    Arguments as of `accelerate`.
-    """
+    """Advance a free body by dt [s]; arguments as of `accelerate`, angular velocities FRD."""
     v, spin = accelerate(velocity, q, omega, force, torque, airframe, dt)
     p, q_new, body = drift(position, v, q, spin, dt)
     return p, v, q_new, body

@@ -54,10 +54,7 @@ class Airframe:
 
 
 def px4_airframe(vehicle: VehicleProfile, output: str) -> Airframe:
-    """Return a quad by PX4's control allocation; `output` is SITL_OUTPUT or HITL_OUTPUT.
-
-    Raises FirmwareMissingError if the profile has no section on PX4.
-    """
+    """Return a quad by PX4's control allocation, or raise FirmwareMissingError."""
     px4 = vehicle.px4
     if px4 is None:
         raise _no_table("px4")

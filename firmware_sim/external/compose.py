@@ -43,10 +43,7 @@ class Wanted:
 
 
 def real_firmware(wanted: Wanted) -> ExternalFlightStack:
-    """Bind the ports of real firmware and return it, not yet started.
-
-    Raises UsageError if a port is taken, or program or profile section are missing.
-    """
+    """Bind the ports of real firmware and return it, not yet started. Raises UsageError."""
     launcher, endpoint = _PARTS[wanted.aircraft.firmware](wanted)
     observer = Observer(endpoint, "observer", wanted.vehicle.told_origin)
     return ExternalFlightStack(launcher, observer, wanted.aircraft.real.firmware_timeout)

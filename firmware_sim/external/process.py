@@ -134,10 +134,7 @@ class FirmwareProcess(ChildProcess):
     """One process of external firmware; it ends with us, also when we are killed."""
 
     def __init__(self, name: str, command: StartCommand, cwd: Path, log: Path) -> None:
-        """Start a named program in a folder, appending its output to `log`.
-
-        Raises FirmwareMissingError if the program is missing or not executable.
-        """
+        """Start a program in a folder, output appended to `log`, or raise FirmwareMissingError."""
         self.name = name
         program = Path(command.argv[0])
         if not os.access(program, os.X_OK) or not program.is_file():

@@ -179,10 +179,7 @@ class FailingEndpoint(FailingSender):
         self._generators: dict[tuple[int, int, int], np.random.Generator] = {}
 
     def begin(self, timeline: FaultTimeline | None) -> None:
-        """Begin an episode: what was under way is lost, and these faults act; None: nothing fails.
-
-        To be called once for every episode.
-        """
+        """Begin an episode with these faults, once for each; what was under way is lost."""
         self._timeline = timeline
         self._generators.clear()
         self._up.clear()

@@ -109,10 +109,7 @@ class ArdupilotBridge:
     """One ArduPilot, one episode. Implements `bridge.Bridge`."""
 
     def __init__(self, port: int, *, silence_s: float = SILENCE_S) -> None:
-        """Open a loopback UDP port, or raise UsageError; ArduPilot sends first.
-
-        `silence_s` is the longest wait for a packet [wall s].
-        """
+        """Open a loopback UDP port, or raise UsageError; packets may take `silence_s` [wall s]."""
         self.rate_hz = 0
         """What ArduPilot asks for: it arms only with 1.8 times its loop rate (SCHED_LOOP_RATE,
         400 Hz) or more."""

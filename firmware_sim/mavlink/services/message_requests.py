@@ -134,10 +134,7 @@ _SPECIAL: Mapping[int, Callable[[Command, Context], Result]] = {
 
 
 def send_stream(name: str, context: Context) -> Result:
-    """Send one of the streamed messages now; DENIED when it has nothing to say.
-
-    UNSUPPORTED for a message that there is not.
-    """
+    """Send a streamed message now; DENIED: nothing to say, UNSUPPORTED: no such message."""
     if name not in context.link.builders:
         return Result.UNSUPPORTED
     sent = context.link.send_stream(name, context.port.state())

@@ -205,10 +205,7 @@ class LogStream:
         self._boundaries = MessageBoundaries(skip=0)
 
     def next_piece(self, read: Callable[[int, int, int], bytes]) -> Piece | None:
-        """Return the next piece, None until enough has been written to fill one.
-
-        `read` is `LogStore.read`.
-        """
+        """Return the next piece by `LogStore.read`, None until enough has been written."""
         room = PIECE_BYTES
         if self.in_head:
             room = min(room, self._head_bytes - self._offset)
