@@ -211,10 +211,7 @@ def _draw_doors(
     parts: tuple[Rect, ...],
     walls: tuple[tuple[int, Rect], ...],
 ) -> tuple[Door, ...]:
-    """Draw doors of a random spanning tree (Kruskal) of the rooms and of some other neighbours.
-
-    Rooms on a corridor are joined to it first.
-    """
+    """Draw doors of a random spanning tree (Kruskal) of the rooms, corridors first, and more."""
     pairs = [pair for k in range(len(walls)) for pair in _neighbours(rooms, parts, walls, k)]
     order = [pairs[i] for i in rng.permutation(len(pairs)).tolist()]
     if rooms.corridor_width_m is not None:

@@ -96,10 +96,7 @@ def _walk_all(
     dwell_s: float,
     least_s: float,
 ) -> tuple[Floats, NDArray[np.int64], Floats]:
-    """Return the way-points (k, 2) of all walks, the count of each (m,), and the speeds (m,).
-
-    The starts are written into the last rows of `center`.
-    """
+    """Return way-points (k, 2), their counts and speeds (m,) of walks; write their starts."""
     n = len(halves)
     points, counts, speeds = np.empty((0, 2)), np.zeros(n, np.int64), np.empty(n)
     for i in range(n):

@@ -234,28 +234,16 @@ def render_depth(
     are seen from both sides. A ray that passes over them has no return, unless there is a ceiling
     at their height. A camera less than `MIN_DEPTH_M` above the ground is lifted to that height (a
     resting vehicle sinks in by the contact's penetration). From inside an obstacle every pixel
-    reads `MIN_DEPTH_M`. In place of the obstacles that a mesh owns its triangles are seen, from
-    inside as well.
+    reads `MIN_DEPTH_M`. Meshes are seen in place of the obstacles that they own, from inside as
+    well.
 
-    Args:
-        out: (height, width) depth [m], written; 0 = no return. Along the optical axis of a pinhole,
-            in the camera's horizontal plane of a cylinder, along the ray of a fisheye.
-        position: (3,) camera NED [m].
-        quaternion: (4,) unit [w, x, y, z] camera -> NED. Its x axis is the optical axis, y points
-            to the right of the image, z to its bottom.
-        focal: Focal length [px] of a pinhole, columns for an angle [px/rad] of a cylinder.
-        cx: Column of the optical axis. Pixel centres are at whole numbers.
-        cy: Row of the optical axis.
-        cylindrical: The image is a cylinder's, as `Intrinsics` defines it.
-        max_range: Greatest depth that gives a return [m].
-        bounds: (6,) `Bounds.as_array()`.
-        shape: (n,) `Shape`.
-        center: (n, 3) NED [m].
-        half_size: (n, 3) as in `Obstacles` [m].
-        yaw: (n,) heading of a box's first axis [rad].
-        meshes: Those that are seen, hills among them; None: there are none, and nothing is spent on
-            them.
-        bent: The rays of a fisheye (`fisheye.bent_of`); None: it is a pinhole or a cylinder.
+    `out` (height, width) is depth [m], written; 0 = no return. It is measured along the optical
+    axis of a pinhole, in the camera's horizontal plane of a cylinder, along the ray of a fisheye.
+    The camera is at `position` NED [m]. Its x axis by `quaternion` (camera -> NED) is the optical
+    axis; y points to the right of the image, z to its bottom. `focal`, `cx`, `cy` and `cylindrical`
+    are those of `Intrinsics`, `bent` the rays of a fisheye (`bent_of`), None for others. `bounds`
+    (6,) is `Bounds.as_array()`; the obstacles' arrays (n, ...) are those of `Obstacles`. `meshes`
+    are those that are seen, hills among them; None costs nothing.
     """
     camera = raised(meshes, position)
     height, width = out.shape

@@ -296,10 +296,7 @@ def _dotted(model: type[BaseModel] | None, path: tuple[int | str, ...]) -> str:
 
 
 def _choices(field: FieldInfo) -> dict[str, type[BaseModel]]:
-    """Return the models that a field chooses from by the value of one of theirs; mostly none.
-
-    Those, too, of which it holds several.
-    """
+    """Return the models, of which a field holds one or several, that a value selects."""
     name, union = field.discriminator, field.annotation
     for part in _annotated_parts(field.annotation):
         for mark in part.__metadata__:

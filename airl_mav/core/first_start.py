@@ -73,10 +73,10 @@ def compile_first(
     stop: Callable[[], bool] = lambda: False,
     workers: int | None = None,
 ) -> None:
-    """Compile the kernels of plans, unless that has been done. Shows nothing if all are cached.
+    """Compile the kernels of plans, unless all are cached; one process per core by default.
 
-    `stop` is polled several times a second; True ends the step. By default one process per core
-    works. Ctrl-C (KeyboardInterrupt) keeps what is compiled, and the next start resumes.
+    `stop` is polled several times a second; True ends the step. Ctrl-C (KeyboardInterrupt) keeps
+    what is compiled.
     """
     folder, missing = _missing(plans)
     if folder is None or not missing:

@@ -115,10 +115,7 @@ TWIN = "gym"
 
 
 def check_twin(faults: Sequence[Fault], *, pipelined: bool = False) -> None:
-    """Raise FieldError for a fault that the twin cannot fly.
-
-    With pipelined decisions, delays beyond the next decision are not modelled.
-    """
+    """Raise FieldError for a fault that the twin cannot fly, with decisions `pipelined` or not."""
     for fault in faults:
         levels = fault.about.levels
         if TWIN not in levels:

@@ -293,10 +293,7 @@ class Appearance(ProfileModel):
         return tuple(dict.fromkeys(m.image for _, m in named if m.image is not None))
 
     def may_have(self, surface: SurfaceName, more: Iterable[str] = ()) -> bool:
-        """Return whether any obstacle may have such a surface.
-
-        `more`: the names of further materials that parts of them have.
-        """
+        """Return whether an obstacle, or a part of one in `more` materials, may be so."""
         kinds = (*self.static.materials, *self.moving.materials, *more)
         return any(self.material(name, (0, 0, 0)).surface == surface for name in kinds)
 

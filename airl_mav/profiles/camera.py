@@ -237,10 +237,7 @@ FurtherCameras = Annotated[dict[str, Camera], BeforeValidator(_each_by_itself)]
 
 
 def with_the_rate(data: Any) -> Any:
-    """Return what a vehicle profile is read from, further cameras with the main one's rate.
-
-    What is no profile is returned as it is, for the validation to refuse.
-    """
+    """Return the data of a vehicle profile, its further cameras with the main one's rate."""
     if not isinstance(data, Mapping):
         return data
     main, further = data.get("camera"), data.get("cameras")

@@ -232,10 +232,7 @@ def read_samples(path: Path, option: str) -> tuple[float, ...]:
 
 
 def existing_profile(path: Path, cpu: str) -> ComputerProfile | None:
-    """Return the profile that a .toml file holds, None when there is no such file.
-
-    Raises UsageError if it is no computer profile, or that of another processor than `cpu`.
-    """
+    """Return the profile in a .toml file, None without one. Raises UsageError for another CPU's."""
     if not path.exists():
         return None
     profile = load_profile("computers", str(path), ComputerProfile)

@@ -65,10 +65,7 @@ def loaded(
 def equipped(
     vehicle: str, computer: str, payload: Payload
 ) -> tuple[VehicleProfile, ComputerProfile]:
-    """Load a vehicle and a computer by name or path; return the vehicle `loaded`, and the computer.
-
-    Raises UsageError if a profile cannot be used, or the rotors do not carry it all.
-    """
+    """Return a vehicle, `loaded`, and its computer, by names or paths. Raises UsageError."""
     board = load_computer(computer)
     return loaded(load_vehicle(vehicle), board, payload), board
 

@@ -53,10 +53,7 @@ def list_profiles(kind: Kind) -> list[str]:
 
 
 def describe_profile(kind: Kind, name: str) -> str:
-    """Return the line in which a shipped profile describes itself, "" when it has none.
-
-    Raises UsageError when there is no such profile, or it is no TOML.
-    """
+    """Return a shipped profile's description, "" without one. Raises UsageError."""
     return str(_read(kind, _path(kind, name), ()).get("description", ""))
 
 

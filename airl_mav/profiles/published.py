@@ -73,10 +73,7 @@ def load_published(name: str = "air-learning") -> Published:
 
 
 def published_gap(reference: PublishedRun, target: PublishedRun) -> PublishedGap:
-    """Work out the differences of two published columns by our own definition, signed.
-
-    They are in percent of the reference. Success in percentage points, 0 where it is not given.
-    """
+    """Return the differences of two published columns, signed: percent, success in points."""
 
     def percent(key: str) -> float:
         first, second = getattr(reference, key), getattr(target, key)

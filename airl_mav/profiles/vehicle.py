@@ -288,10 +288,7 @@ class VehicleProfile(ProfileModel):
         return self
 
     def too_heavy(self, mass_kg: float, thrust_share: float = 1.0) -> str | None:
-        """Return why the rotors do not carry a mass with a margin to fly with; None: they do.
-
-        They give `thrust_share` of the thrust that the profile says.
-        """
+        """Return why the rotors, at a share of their thrust, do not carry a mass with a margin."""
         needed_n = (1.0 + THRUST_MARGIN) * mass_kg * GRAVITY_M_S2
         thrust_n = thrust_share * self.thrust_n
         if thrust_n >= needed_n:
@@ -323,21 +320,14 @@ class VehicleProfile(ProfileModel):
         return len(CORNERS) * self.rotor.thrust_max_n
 
     def autopilot_parameters(self) -> dict[str, float]:
-        """Return what the built-in autopilot is set to: its rotors' places, what `parameters` say.
-
-        By PX4's names; only those that it has.
-        """
+        """Return the built-in autopilot's parameters: its rotors' places, and `parameters`."""
         known = {spec.name for spec in SPECS}
         places = {n: v for n, v in self.rotor.px4_geometry().items() if n in known}
         return {**places, **self.parameters}
 
 
 def load_vehicle(name: str) -> VehicleProfile:
-    """Return a vehicle profile by name or path.
-
-    Raises UsageError when it cannot be used, or sets a parameter that the flight controller does
-    not know or accept.
-    """
+    """Return a vehicle profile by name or path, or raise UsageError."""
     vehicle = load_profile("vehicles", name, VehicleProfile)
     try:
         parameter_values(vehicle.parameters)

@@ -41,11 +41,7 @@ def make_model(
     tensorboard_log: str | None = None,
     device: str = "cpu",
 ) -> BaseAlgorithm:
-    """Build a learner with fresh weights; makes torch use one thread.
-
-    Raises:
-        UsageError: Unknown algorithm or option, unsupported field or value, or unsupported actions.
-    """
+    """Build a learner with fresh weights on one torch thread, or raise UsageError."""
     # More threads than free cores make the small matrices here 5 to 10 times slower.
     torch.set_num_threads(1)
     row = ALGORITHMS[algorithm.name]

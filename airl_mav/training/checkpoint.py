@@ -233,11 +233,7 @@ class DamagedError(Exception):
 
 
 def save_checkpoint(folder: Path, model: BaseAlgorithm, meta: Mapping[str, Any]) -> Path:
-    """Write a checkpoint and return its folder. Only the previous one is kept.
-
-    The learner is between two rollouts and its environment `Restorable`; `meta` is JSON data for
-    `load_latest`.
-    """
+    """Write a checkpoint with JSON data `meta`; return its folder. Keeps the previous one."""
     folder.mkdir(parents=True, exist_ok=True)
     for leftover in folder.glob(f"{PREFIX}*{PARTIAL}"):
         shutil.rmtree(leftover)

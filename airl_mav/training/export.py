@@ -195,10 +195,7 @@ def check_spaces(
     actions: action_sets.ActionSpec,
     normalised: Collection[str] = (),
 ) -> None:
-    """Raise UsageError unless a model takes a layout's arrays and gives an action set.
-
-    Arrays of `normalised` keys were floats in training.
-    """
+    """Raise UsageError unless a model takes a layout's arrays and gives an action set."""
     seen = model.observation_space
     wanted = {key: (box.shape, box.dtype) for key, box in boxes(spec).items()}
     accepted = ", ".join(f"{k} {np.dtype(kind)} {shape}" for k, (shape, kind) in wanted.items())

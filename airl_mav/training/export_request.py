@@ -230,10 +230,7 @@ class ExportRequest(BaseModel):
         return names_code(self.model)
 
     def facts(self, command: str, taken: Taken | None = None) -> PolicyFacts:
-        """Return the card data; `taken` is that from the loaded model, `command` the command line.
-
-        Raises UsageError if a field is missing, contradicts another or is out of range.
-        """
+        """Return the card data, `taken` from the loaded model; UsageError for a wrong field."""
         if self.algorithm is None and not self.own_module:
             raise FieldError("algorithm", accepted="the class that wrote the .zip: DQN, PPO, ...")
         if self.weights is not None and not self.own_module:

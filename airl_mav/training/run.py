@@ -133,10 +133,7 @@ def train(
 
 
 def check_trainable(config: TrainingConfig, name: str, device: str = "cpu") -> None:
-    """Raise UsageError where a training could not begin or its network not be exported.
-
-    Custom code is exported once as a test, which takes seconds.
-    """
+    """Raise UsageError if a training could not begin, or custom code not be exported."""
     env = environment_of(config)
     check_actions(config.algorithm.name, kind_of(config.environment.actions))
     model = learner_of(config, env, device)
