@@ -300,7 +300,7 @@ def _sphere(mi: Any, finish: Finish, row: int, center: Floats, radius: float) ->
 
 
 def _mesh(mi: Any, finish: Finish, row: int, placed: PlacedMesh) -> Any:
-    """Return a mesh of flat triangles. Its pattern lies on them as `mesh_surfaces` has it."""
+    """Return a mesh of flat triangles. Its pattern is that of `surfaces.shade_meshes`."""
     vertices, faces = standing(placed)
     corners = placed.scale * triangles_of(placed.file).corners.astype(np.float64)
     return _triangles(mi, finish, row, corners, vertices[faces])
@@ -314,7 +314,7 @@ def _hills(mi: Any, finish: Finish, ground: Ground) -> Any:
 
 
 def _triangles(mi: Any, finish: Finish, row: int, corners: Floats, placed: Floats) -> Any:
-    """Return flat triangles with a pattern as in `mesh_surfaces`.
+    """Return flat triangles with a pattern as in `surfaces.shade_meshes`.
 
     `corners` (m, 3, 3) are along the mesh's axes, `placed` (m, 3, 3) NED [m]; `row` is the
     material.
