@@ -29,7 +29,7 @@ from airl_mav.arena.rooms import Plan, draw_plan, room_walls, standing_on_the_fl
 from airl_mav.arena.tours import draw_tours
 from airl_mav.arena.zones import draw_goal, zone_radius_m
 from airl_mav.core.errors import UsageError
-from airl_mav.core.streams import seeded
+from airl_mav.core.seeding import seeded
 from airl_mav.profiles.arena import OBSTACLES, ArenaSpec
 from airl_mav.profiles.rooms import HEADROOM_M
 

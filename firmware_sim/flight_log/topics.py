@@ -14,6 +14,9 @@ from firmware_sim.flight_log import values
 from firmware_sim.flight_log.ulog import Topic, Values
 from firmware_sim.flight_log.values import MOTORS, Moment
 
+ON_CHANGE_US = 500 * US_PER_MS
+"""A state is logged when it changes, and this often anyway [µs]."""
+
 
 @dataclass(frozen=True)
 class Logged:

@@ -51,7 +51,7 @@ CAMERA = Intrinsics.from_fov(96, 64, 1.5)
 
 
 def path_traced(*scene: Any, samples: int, seed: int = 0) -> NDArray[np.uint8]:
-    return PathTracer(samples)(*scene, seed)
+    return PathTracer(samples)(*scene, seed=seed)
 
 
 def arena(name: str, seed: int, **appearance: Any) -> Arena:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from airl_mav.core.streams import seeded
+from airl_mav.core.seeding import seeded
 
 NUMBERS = st.one_of(st.integers(0, 2**32 - 1), st.integers(0, 2**70), st.sampled_from([0, 2**32]))
 
