@@ -46,16 +46,15 @@ SENSOR_COMBINED = Topic(
 
 def _logged(
     name: str,
-    interval_ms: int,
+    interval_ms: int | None,
     values: Callable[[Moment], Values | None],
     fields: str,
-    *,
-    on_change: bool = False,
 ) -> Logged:
-    """Return a topic whose fields are "type name ...; type name ..."."""
+    """Return a topic whose fields are "type name ...; type name ..."; None = logged on change."""
     groups = (group.split() for group in fields.split("; "))
     each = tuple(f"{kind} {name}" for kind, *names in groups for name in names)
-    return Logged(Topic(name, each), interval_ms * US_PER_MS, values, on_change)
+    interval_us = ON_CHANGE_US if interval_ms is None else interval_ms * US_PER_MS
+    return Logged(Topic(name, each), interval_us, values, on_change=interval_ms is None)
 
 
 TOPICS: tuple[Logged, ...] = (
@@ -186,25 +185,22 @@ TOPICS: tuple[Logged, ...] = (
     ),
     _logged(
         "vehicle_status",
-        500,
+        None,
         values.status,
         "uint8_t arming_state nav_state_user_intention nav_state vehicle_type; "
         "bool failsafe pre_flight_checks_pass",
-        on_change=True,
     ),
-    _logged("actuator_armed", 500, values.armed, "bool armed ready_to_arm", on_change=True),
+    _logged("actuator_armed", None, values.armed, "bool armed ready_to_arm"),
     _logged(
         "vehicle_land_detected",
-        500,
+        None,
         values.land_detected,
         "bool ground_contact maybe_landed landed",
-        on_change=True,
     ),
     _logged(
         "home_position",
-        500,
+        None,
         values.home,
         "double lat lon; float alt; bool valid_alt valid_hpos",
-        on_change=True,
     ),
 )
