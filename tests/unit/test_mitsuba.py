@@ -50,8 +50,17 @@ PLAIN = {
 CAMERA = Intrinsics.from_fov(96, 64, 1.5)
 
 
-def path_traced(*scene: Any, samples: int, seed: int = 0) -> NDArray[np.uint8]:
-    return PathTracer(samples)(*scene, seed=seed)
+def path_traced(
+    scene: Arena,
+    centers: Any,
+    camera: Intrinsics,
+    place: Any,
+    turn: Any,
+    *,
+    samples: int,
+    seed: int = 0,
+) -> NDArray[np.uint8]:
+    return PathTracer(samples)(scene, centers, camera, place, turn, seed)
 
 
 def arena(name: str, seed: int, **appearance: Any) -> Arena:
