@@ -18,8 +18,7 @@ from airl_mav.core.constants import TICK_US
 from airl_mav.core.streams import Stream, stream
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import Aircraft
-from airl_mav.vehicle.airframe import Airframe
-from airl_mav.vehicle.spread import draw_airframe
+from airl_mav.vehicle.airframe import Airframe, draw_airframe
 from airl_mav.vehicle.wind import wind_of_episode
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.parameter_store import Keeper, Parameters
@@ -28,8 +27,7 @@ from firmware_sim.engine.record import FLOWN_TICK, TRUE_TICK
 from firmware_sim.engine.ticks import ALIGN, COLLIDED, FUSE, log_flown_record, log_record
 from firmware_sim.faults.camera import FailingCamera
 from firmware_sim.faults.controller import FailingParts
-from firmware_sim.faults.injection import ClientFaults
-from firmware_sim.faults.timeline import FaultTimeline
+from firmware_sim.faults.timeline import ClientFaults, FaultTimeline
 from firmware_sim.flight_controller import FlightController
 from firmware_sim.hover_start import HoverStart
 from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth

@@ -11,11 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.camera.fisheye import bent_of
 from airl_mav.camera.frame import MAX_MM, MM_PER_M
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.noise import DepthNoise, noise_of, noisy_frame
-from airl_mav.camera.projection import Bent
+from airl_mav.camera.projection import Bent, bent_of
 from airl_mav.camera.raycast import render_depth
 from airl_mav.camera.render import Mount, camera_pose
 from airl_mav.core.constants import TICK_US, US_PER_S

@@ -36,12 +36,7 @@ def flight_plan(vehicle: VehicleProfile, plant: PlantName) -> CompilePlan:
 
 
 def vectorized_plan(kind: CameraKind, *, recorded: bool) -> CompilePlan:
-    """Return what level gym needs, whose flights are recorded, or a training.
-
-    Args:
-        kind: Of the main camera's images.
-        recorded: Whether flights are recorded.
-    """
+    """Return the kernels of level gym, whose flights are recorded, or of a training."""
     how = {"recorded": recorded}
     return CompilePlan(
         "vectorized",

@@ -37,7 +37,6 @@ class Exported(Event):
 
     event: ClassVar[str] = "policy"
     path: str
-    """Folder of the policy, for `--policy`."""
 
 
 class TrainingBar(TrainingProgress):

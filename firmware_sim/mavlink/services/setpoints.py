@@ -2,7 +2,7 @@
 
 Source: PX4 MavlinkReceiver::handle_message_set_position_target_local_ned, _global_int and
 _set_attitude_target, checked against a running PX4 1.16. PX4 says for every message that it is
-refused; here the same refusal is told once, until a setpoint is accepted again.
+refused. Here the same refusal is told once, until a setpoint is accepted again.
 """
 
 from __future__ import annotations
@@ -205,7 +205,5 @@ def _is_local(message: WireMessage) -> bool:
 
 def _reject(context: Context, why: Message) -> bool:
     context.port.refuse_setpoint(why.text, context.now_us)
-    if why.text not in context.refusals:
-        context.refusals.add(why.text)
-        context.announce(why)
+    context.announce_once(why)
     return False
