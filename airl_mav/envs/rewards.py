@@ -104,9 +104,9 @@ def timed(step: Step) -> NDArray[np.float64]:
 def progress(step: Step) -> NDArray[np.float64]:
     """Return 4 for the goal, -4 for a failure, much for progress, less for time and turning.
 
-    For policies that decide with every image, as those that command body rates: what a decision is
-    worth is seen in its progress (Song et al., Autonomous Drone Racing with Deep Reinforcement
-    Learning, IROS 2021, eq. 3). Of other actions the yaw rate is what turns.
+    For policies that decide with every image, as those that command body rates. Source: Song et
+    al., Autonomous Drone Racing with Deep Reinforcement Learning, IROS 2021, eq. 3. For other
+    actions the turn is the yaw rate.
     """
     passed_s = step.now.time_s - step.before.time_s
     ended = AGILE_BONUS * _ended(step) - AGILE_TURN * _turned(step)

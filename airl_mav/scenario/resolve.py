@@ -1,4 +1,4 @@
-"""From what was asked for to what is flown: every profile and the policy are read exactly once."""
+"""Resolve a scenario. Every profile and the policy are read exactly once."""
 
 from __future__ import annotations
 
