@@ -32,8 +32,14 @@ from scipy.stats import chi2
 
 from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import TICK_S, US_PER_S
-from airl_mav.core.frames import Vector, geodetic_to_local, local_to_geodetic, quat_wxyz_to_xyzw
-from airl_mav.core.location import HOME, MAGNETIC_FIELD_NED
+from airl_mav.core.frames import (
+    HOME,
+    MAGNETIC_FIELD_NED,
+    Vector,
+    geodetic_to_local,
+    local_to_geodetic,
+    quat_wxyz_to_xyzw,
+)
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from airl_mav.vehicle.atmosphere import altitude_m, pressure_hpa
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot

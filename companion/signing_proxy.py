@@ -12,8 +12,7 @@ from pathlib import Path
 
 from airl_mav.core.errors import UsageError
 from airl_mav.core.ports import LOOPBACK
-from airl_mav.core.signing import frames_of
-from airl_mav.core.signing_key import StoredSigning
+from airl_mav.core.signing import StoredSigning, frames_of
 from companion.interfaces import LinkError
 
 LINK_ID = 2

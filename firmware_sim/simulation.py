@@ -18,8 +18,7 @@ from airl_mav.core.constants import TICK_US
 from airl_mav.core.streams import Stream, stream
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import Aircraft
-from airl_mav.vehicle.airframe import Airframe
-from airl_mav.vehicle.spread import draw_airframe
+from airl_mav.vehicle.airframe import Airframe, draw_airframe
 from airl_mav.vehicle.wind import wind_of_episode
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.parameter_store import Keeper, Parameters
@@ -28,8 +27,7 @@ from firmware_sim.engine.record import FLOWN_TICK, TRUE_TICK
 from firmware_sim.engine.ticks import ALIGN, COLLIDED, FUSE, log_flown_record, log_record
 from firmware_sim.faults.camera import FailingCamera
 from firmware_sim.faults.controller import FailingParts
-from firmware_sim.faults.injection import ClientFaults
-from firmware_sim.faults.timeline import FaultTimeline
+from firmware_sim.faults.timeline import ClientFaults, FaultTimeline
 from firmware_sim.flight_controller import FlightController
 from firmware_sim.hover_start import HoverStart
 from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth
@@ -160,7 +158,8 @@ class Simulation:
         self.flown = self._flown[:0]
         """Log of the built-in flight controller in them (`engine.record.FLOWN_TICK`)."""
         self._clock = clock
-        self._sample: SensorSample = self.plant.sense()
+        self._sample: SensorSample | None = self.plant.sense()
+        """The newest; None = that of the newest compiled tick."""
 
     def begin(self) -> None:
         """Say that the episode begins now: what was flown and recorded so far is no part of it."""
@@ -222,20 +221,23 @@ class Simulation:
 
     def _tick_by_python(self, autopilot: BuiltinAutopilot | None) -> int:
         """Fly a tick whose sample or commands are not the engine's; return 1."""
-        self._sample = self.plant.step(self._fly(self._sample))
+        before = self.plant.newest() if self._sample is None else self._sample
+        self._sample = sample = self.plant.step(self._fly(before))
         log_record(self.plant.record, self._truths)
         if autopilot is not None:
             log_flown_record(autopilot.record, self._flown)
-            self._flown["battery"][0] = self._sample.battery
+            self._flown["battery"][0] = sample.battery
             if self._fly is self._unaltered:
-                autopilot.take(self._sample)  # as compiled ticks do
+                autopilot.take(sample)  # as compiled ticks do
         return 1
 
     def _stretch(
         self, autopilot: BuiltinAutopilot, until_us: float, arrivals: Arrivals | None
     ) -> int:
         """Fly compiled ticks; return how many."""
-        autopilot.take(self._sample)
+        if self._sample is not None:
+            autopilot.take(self._sample)
+            self._sample = None
         plant, done, time_us = self.plant, 0, self.time_us
         most = max(1, math.ceil(min((until_us - time_us) / TICK_US, MOST_TICKS)))
         arrives_us = math.inf if arrivals is None else arrivals.next_us
@@ -254,7 +256,6 @@ class Simulation:
             # After what Python fuses, other aids may be in use.
             if changed or event in _ENDS or (event == FUSE and not autopilot.compiled):
                 break
-        self._sample = autopilot.sample or self._sample
         return done
 
     def _glide(self, autopilot: BuiltinAutopilot, first: int, end: int) -> tuple[int, int]:

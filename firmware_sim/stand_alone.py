@@ -1,4 +1,4 @@
-"""The firmware by itself: ticks until told to stop, and what can be said of them."""
+"""Stand-alone firmware: ticks until it is stopped. Then a summary."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ from airl_mav.core.clock import SimClock, WallClock
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.core.ports import LOOPBACK
-from airl_mav.core.signing_key import read_key
+from airl_mav.core.signing import read_key
 from airl_mav.policy.actions import limited
 from airl_mav.policy.greedy import GreedyPolicy
 from airl_mav.policy.observation import Kinematics, encode

@@ -19,7 +19,7 @@ from airl_mav.profiles.appearance import (
     Surfaces,
     TextureName,
 )
-from airl_mav.profiles.image_file import ImageFile
+from airl_mav.profiles.asset_files import ImageFile
 
 Floats = NDArray[np.float64]
 Rgb = tuple[int, int, int]
@@ -130,13 +130,8 @@ def draw_appearance(
 ) -> Drawn:
     """Draw the appearance of an arena; deterministic.
 
-    Args:
-        appearance: Settings.
-        seed: Seed of the arena; `appearance.period` consecutive seeds share their draws.
-        n_static: Number of static primitives.
-        n_moving: Number of moving obstacles.
-        wall_colour: sRGB of the material `wall_colour`, 0-255.
-        statics: Groups of static primitives; None = each on its own.
+    `appearance.period` consecutive seeds share their draws. `wall_colour` is the sRGB of the
+    material of that name, 0-255; `statics` are groups of static primitives, None = each on its own.
     """
     draw = seed // appearance.period
     kinds: list[tuple[_Part, Surfaces, int]] = [

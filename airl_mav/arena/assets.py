@@ -17,8 +17,8 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.kernels import kernel
 from airl_mav.profiles.appearance import DEFAULT
 from airl_mav.profiles.arena import SHAPES, SPHERE_OFFSET, ArenaSpec, StaticObstacles
+from airl_mav.profiles.asset_files import MeshFile
 from airl_mav.profiles.assets import Asset
-from airl_mav.profiles.mesh_file import MeshFile
 
 _BOX, _SPHERE = int(Shape.BOX), int(Shape.SPHERE)
 

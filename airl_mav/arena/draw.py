@@ -56,15 +56,7 @@ def draw_arena(
     goal_radius_m: float | None = None,
     zone_radii_m: Sequence[float] = (),
 ) -> None:
-    """Draw the arena on axes, whose limits, aspect and labels are set.
-
-    Args:
-        arena: The arena.
-        ax: The axes.
-        time_us: Time since the start of the episode [µs].
-        goal_radius_m: Radius of the goal disc [m]; None = no disc.
-        zone_radii_m: Radii of curriculum zones [m].
-    """
+    """Draw the arena `time_us` after the start; set limits, aspect and labels of `ax`."""
     _draw_floor(arena, ax)
     _draw_zones(arena, ax, zone_radii_m)
     for tour in arena.tours:

@@ -1,7 +1,7 @@
 """Gates: walls across the arena with an opening, that the vehicle has to fly through.
 
 A gate is four boxes around its opening: west and east of it up to the top, below and above it
-between these; no other code needs to know gates.
+between these. No other code needs to know gates.
 """
 
 from __future__ import annotations

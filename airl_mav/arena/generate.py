@@ -104,17 +104,10 @@ def generate(
 ) -> Arena:
     """Make the arena of a seed, deterministic on any machine with this numpy.
 
-    The obstacles depend on the zone only if a first layout had no room for the goal.
-
-    Args:
-        spec: Settings.
-        seed: Not negative; `spec.count_period` consecutive seeds share their obstacle counts.
-        name: Name for the arena and messages.
-        vehicle_width_m: Minimum width of the way from start to goal [m].
-        zone: Curriculum zone that bounds the goal; None = the largest.
-
-    Raises:
-        UsageError: Invalid argument, or no arena found in LAYOUTS layouts, with the reason.
+    `spec.count_period` consecutive seeds, from 0 on, share their obstacle counts. The way from
+    start to goal is at least `vehicle_width_m` wide. The curriculum `zone` bounds the goal, None =
+    the largest. The obstacles depend on it only if a first layout had no room for the goal. Raises
+    UsageError with the reason if an argument is invalid or LAYOUTS layouts had no arena.
     """
     if seed < 0:
         raise UsageError(f"seed = {seed}: accepted: value >= 0")

@@ -39,19 +39,15 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.core.fields import ArrayField
 from airl_mav.core.goals import Goal
 from airl_mav.profiles.appearance import DEFAULT, Appearance
-from airl_mav.profiles.mesh_file import MeshFile
+from airl_mav.profiles.asset_files import MeshFile
 
 
 def indoors(look: Drawn, floor_m2: float, walls: tuple[tuple[int, float], ...]) -> Drawn:
     """Return a look with the sky's light from the ceiling and no sun.
 
     The mean luminance on the floor equals that of a level surface outdoors, interreflections of
-    walls and floor included.
-
-    Args:
-        look: Look without a ceiling.
-        floor_m2: Area of the floor [m²].
-        walls: Row in the `Finish` and visible area [m²] of each wall surface.
+    walls and floor included. `walls` are row in the `Finish` and visible area [m²] of each wall
+    surface.
     """
     light, albedo = look.light, look.finish.albedo.mean(axis=1)
     areas = np.array([area for _, area in walls])

@@ -1,6 +1,6 @@
 """An asset from a mesh: boxes along its axes that cover its surface.
 
-The mesh is cut into cubic cells; those at its surface and inside a closed one are joined to boxes,
+The mesh is cut into cubic cells. Those at its surface and inside a closed one are joined to boxes,
 which exceed it by at most `MeshBoxes.beyond_m`. Cameras see the mesh itself (`triangles`).
 """
 
@@ -75,17 +75,10 @@ def boxes_of_mesh(
 ) -> MeshBoxes:
     """Return a mesh as an asset of at most `most` boxes, with the finest possible cells.
 
-    The middle of the mesh's footprint is the asset's origin, its lowest point stands on the floor,
-    and its x axis points forward.
-
-    Args:
-        path: An STL, OBJ, GLB, glTF, PLY or OFF file.
-        most: Maximum number of boxes, 1 to `MOST_PARTS`.
-        scale: Metres per unit of the file.
-        up: Axis of the file that points up; "auto": y for GLB and glTF, else z.
-
-    Raises:
-        UsageError: The file cannot be read, holds no surface, or is too large for an asset.
+    The middle of the mesh's footprint is the asset's origin. Its lowest point stands on the floor.
+    Its x axis points forward. The file is STL, OBJ, GLB, glTF, PLY or OFF. `scale` is metres per
+    unit of it, `up` its axis that points up; "auto": y for GLB and glTF, else z. Raises UsageError
+    if it cannot be read, holds no surface, or is too large for an asset.
     """
     mesh = _read(path)
     if up == "y" or (up == "auto" and path.suffix.lower() in Y_UP):

@@ -41,15 +41,9 @@ def draw_place(
 ) -> bool:
     """Draw a free place for a bounding box, uniform over all; return whether TRIES sufficed.
 
-    Args:
-        rng: Generator.
-        half: (2,) half extents of the box [m].
-        center: (k, 2) centres of the boxes that it must not overlap [m].
-        taken: (k, 2) their half extents, any clearance already added [m].
-        low: (2,) south-west corner of the floor [m].
-        high: (2,) north-east corner of it [m].
-        gap_m: Minimum gap to the walls [m].
-        place: (2,) north, east [m]; written.
+    It must not overlap the boxes `center`, `taken` (k, 2), any clearance already added. It keeps
+    `gap_m` to the walls of the floor `low`..`high`. All are north, east [m]. `half` and `taken` are
+    half extents. `place` (2,) is written.
     """
     lowest = low + (half + gap_m)
     span, grown = high - (half + gap_m) - lowest, taken + half
@@ -67,10 +61,10 @@ def draw_place(
 def _first_free(
     numbers: Floats, lowest: Floats, span: Floats, center: Floats, grown: Floats, place: Floats
 ) -> bool:
-    """Write the first point of a rectangle that is in no box; return whether there is one.
+    """Write the first point of a rectangle that is in no box. Return whether there is one.
 
     The rectangle has the south-west corner `lowest` and the sides `span` (2,) [m], in which
-    `numbers` (k, 2) in [0, 1) are the points; the boxes have `center` and half extents `grown` (m,
+    `numbers` (k, 2) in [0, 1) are the points. The boxes have `center` and half extents `grown` (m,
     2) [m].
     """
     for number in numbers:
@@ -86,10 +80,8 @@ def place_all(
 ) -> Floats:
     """Draw places (n, 2) [m] of bounding boxes (n, 2) `gap_m` apart from each other and the walls.
 
-    `keep_off` are other boxes, any clearance already added.
-
-    Raises:
-        NoRoomError: One found no place in TRIES tries; `progress` is the number of placed boxes.
+    `keep_off` are other boxes, any clearance already added. Raises NoRoomError: one found no place
+    in TRIES tries; `progress` is the number of placed boxes.
     """
     n, boxes = len(halves), with_room(keep_off, halves + gap_m)
     low, high = inner(bounds, 0.0)

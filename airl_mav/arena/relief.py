@@ -5,7 +5,7 @@ Between the points of its grid it is the triangles that `arena.ground` defines.
 Random numbers on a coarse lattice are joined by a uniform cubic B-spline (de Boor, A practical
 guide to splines, 1978), which has no steps in its slope nor in its curvature. What lies above the
 middle of them rises as its square, so that hills begin without an edge. There are only sums and
-products of the numbers drawn: a seed gives the same bits on any machine.
+products of the numbers drawn. A seed gives the same bits on any machine.
 """
 
 from __future__ import annotations

@@ -94,11 +94,7 @@ class Plan:
 def draw_plan(
     rng: np.random.Generator, spec: ArenaSpec, bounds: Bounds, keep_off: Boxes, name: str
 ) -> Plan:
-    """Draw the rooms of an arena within bounds, without walls in `keep_off`.
-
-    Raises:
-        UsageError: No such plan was found.
-    """
+    """Draw rooms within bounds, without walls in `keep_off`. Raises UsageError if none fits."""
     rooms, width_m = spec.rooms, spec.rooms.corridor_width_m
     count = int(rng.integers(*rooms.count, endpoint=True))
     floor = Rect((bounds.north_min, bounds.east_min), (bounds.north_max, bounds.east_max))
@@ -215,10 +211,7 @@ def _draw_doors(
     parts: tuple[Rect, ...],
     walls: tuple[tuple[int, Rect], ...],
 ) -> tuple[Door, ...]:
-    """Draw doors of a random spanning tree (Kruskal) of the rooms and of some other neighbours.
-
-    Rooms on a corridor are joined to it first.
-    """
+    """Draw doors of a random spanning tree (Kruskal) of the rooms, corridors first, and more."""
     pairs = [pair for k in range(len(walls)) for pair in _neighbours(rooms, parts, walls, k)]
     order = [pairs[i] for i in rng.permutation(len(pairs)).tolist()]
     if rooms.corridor_width_m is not None:

@@ -96,10 +96,7 @@ def _walk_all(
     dwell_s: float,
     least_s: float,
 ) -> tuple[Floats, NDArray[np.int64], Floats]:
-    """Return the way-points (k, 2) of all walks, the count of each (m,), and the speeds (m,).
-
-    The starts are written into the last rows of `center`.
-    """
+    """Return way-points (k, 2), their counts and speeds (m,) of walks; write their starts."""
     n = len(halves)
     points, counts, speeds = np.empty((0, 2)), np.zeros(n, np.int64), np.empty(n)
     for i in range(n):
@@ -222,7 +219,7 @@ def _timed(
     """Return times [s] and places [m] of tours at constant speeds, and where each ends.
 
     `points` (k, 2) are the way-points of all tours [m], `counts` (m,) their numbers, `speeds` (m,)
-    [m/s], `legs` (k - 1,) the distances [m]; a stop at each point but the first takes `dwell_s`.
+    [m/s], `legs` (k - 1,) the distances [m]. A stop at each point but the first takes `dwell_s`.
     """
     stops = 1 if dwell_s > 0.0 else 0
     times, places = np.empty(len(points) * (1 + stops)), np.empty((len(points) * (1 + stops), 2))

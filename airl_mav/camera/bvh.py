@@ -1,9 +1,9 @@
 """A bounding volume hierarchy over the triangles of a mesh, built once for each mesh.
 
 A binary tree of boxes along the mesh's axes (Wald, On fast construction of SAH-based bounding
-volume hierarchies, 2007): each split is the one of least expected cost of a ray, by the surface
-areas of both sides, among `BINS` places along each axis. The tree lies in flat arrays, depth first:
-the left child of an inner node is the next node.
+volume hierarchies, 2007). Each split is the one of least expected cost of a ray, by the surface
+areas of both sides, among `BINS` places along each axis. The tree lies in flat arrays, depth first.
+The left child of an inner node is the next node.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from airl_mav.arena.triangles import KEPT, Triangles, triangles_of
 from airl_mav.camera.primitives import GROUND, OBSTACLE
 from airl_mav.camera.projection import MIN_DEPTH_M
 from airl_mav.core.kernels import borrowing_kernel, large_kernel
-from airl_mav.profiles.mesh_file import MeshFile
+from airl_mav.profiles.asset_files import MeshFile
 from airl_mav.vehicle.rotation import Vec
 
 BINS: Final = 16
@@ -89,7 +89,7 @@ def _build(
 ) -> int:
     """Write the tree over m boxes, `low` and `high` (m, 3); return its number of nodes.
 
-    `order` (m,) are the boxes' numbers, sorted by leaf; written are `bounds` (2 m - 1, 6), lowest
+    `order` (m,) are the boxes' numbers, sorted by leaf. Written are `bounds` (2 m - 1, 6), lowest
     and highest corner of each node, and `links` (2 m - 1, 2), as of `Bvh`.
     """
     waiting = np.empty((STACK + 1, 4), np.int64)  # begin, end, parent of a right child, level
@@ -324,14 +324,8 @@ def meshes_of(
 ) -> Meshes | None:
     """Return an arena's meshes, hills included; None without meshes, hills and glass.
 
-    Args:
-        placed: The meshes.
-        n_obstacles: Obstacles of the arena.
-        ground: Its hills.
-        clear: (n,) obstacles that depth passes through, `Arena.clear`; None = none, as for colour.
-
-    Raises:
-        UsageError: A file is missing or has changed.
+    Depth passes through the obstacles `clear` (n,), `Arena.clear`; None = none, as for colour.
+    Raises UsageError if a file is missing or has changed.
     """
     if not placed and ground is None and clear is None:
         return None
@@ -346,10 +340,7 @@ def placed_in(
     n_obstacles: int,
     clear: NDArray[np.bool_] | None = None,
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32], NDArray[np.float64]]:
-    """Return `owner`, `first`, `root` and `pose` of `Meshes`, with hills if in `roots`.
-
-    `clear` as of `meshes_of`; depth ends on meshes of glass.
-    """
+    """Return `owner`, `first`, `root` and `pose` of `Meshes`, with hills if in `roots`."""
     owner = np.full(n_obstacles, -1, np.int32)
     if clear is not None:
         owner[clear] = UNSEEN

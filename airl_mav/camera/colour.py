@@ -12,22 +12,24 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.arena.appearance import FLOOR as FLOOR_ROW
 from airl_mav.arena.appearance import OBSTACLE as OBSTACLE_ROW
 from airl_mav.arena.appearance import WALLS as WALLS_ROW
 from airl_mav.camera import surfaces
 from airl_mav.camera.bvh import Meshes, count_of, is_owned, raised
 from airl_mav.camera.gloss import Gloss, let_through
-from airl_mav.camera.mesh_shadows import shade_by_meshes
-from airl_mav.camera.mesh_surfaces import shade_meshes
 from airl_mav.camera.mesh_triangles import Faces
 from airl_mav.camera.primitives import FLOOR, GROUND, OBSTACLE, SKY, Ids, Rectangles
-from airl_mav.camera.projection import MIN_DEPTH_M, Bent, Pose, View
-from airl_mav.camera.ray_ends import Look
-from airl_mav.camera.raycast import aim, blank, draw_bodies, invert
+from airl_mav.camera.projection import MIN_DEPTH_M, Bent, Optics, Scene
+from airl_mav.camera.raycast import aim, blank, body_of, draw_bodies, invert
 from airl_mav.camera.reflections import draw_reflections
-from airl_mav.camera.shading import F32, ZERO, Lit, Packed, Plane, Points, Rays, surface_of
-from airl_mav.camera.shadows import CORNERS, shade_by_obstacle, shade_by_walls
+from airl_mav.camera.shading import F32, ZERO, Canvas, Lit, Look, Packed, Plane, Points, Rays
+from airl_mav.camera.shadows import (
+    CORNERS,
+    Shaded,
+    shade_by_meshes,
+    shade_by_obstacle,
+    shade_by_walls,
+)
 from airl_mav.core.kernels import borrowing_kernel, kernel
 from airl_mav.vehicle.rotation import Quat, Vec
 
@@ -104,7 +106,7 @@ def render_colour(
     """Render the colour image of an arena; arguments not listed as of `render_depth`.
 
     `rgb` (height, width, 3) sRGB, `depth` (height, width) unlimited [m], 0 = no surface, and `seen`
-    are written; the image is black from inside an obstacle. `seen` is CEILING, SKY, ... of
+    are written. The image is black from inside an obstacle. `seen` is CEILING, SKY, ... of
     `primitives`, FLOOR also for hills, OBSTACLE + the number of an obstacle or of a mesh's first.
     `texture` (2 + n,), `offset` (2 + n, 2) and `albedo` (2 + n, 2, 3) are those of `Finish`,
     `per_m` (2 + n,) periods of the pattern per metre, `atlas` is `textures.atlas()`. `gloss`
@@ -118,18 +120,17 @@ def render_colour(
     far, ids = (work.far, work.ids) if cylindrical else (depth, seen)
     rectangles = np.zeros((len(shape) + count_of(meshes), 3, 4), np.int32)
     faces = None if meshes is None else np.empty(far.shape, np.int32)
-    inside = draw_bodies(
-        far, ids, rectangles, lines, xs, bent, view, axes, camera, bounds, shape, center, half_size,
-        yaw, meshes, faces,
-    )  # fmt: skip
+    optics = Optics(lines, xs, bent, view, axes, camera)
+    scene = Scene(bounds, shape, center, half_size, yaw)
+    inside = draw_bodies(far, ids, rectangles, optics, scene, meshes, faces)
     if inside >= 0:
         _show_inside(rgb, depth, seen, inside, bent)
         return
     invert(far)
-    _show(
-        rgb, far, ids, rectangles, faces, work, bent, view, axes, camera, bounds, shape, center,
-        half_size, yaw, meshes, texture, per_m, offset, albedo, gloss, lights, atlas,
-    )  # fmt: skip
+    pixel2 = F32(1.0 / (view.focal * view.focal))
+    light = _lit(lights)
+    look = Look(texture, per_m, offset, albedo, gloss, light, atlas, pixel2)  # type: ignore[arg-type]
+    _show(rgb, far, ids, rectangles, faces, work, optics, scene, meshes, look, gloss)
     if cylindrical:
         depth[:, :] = far.T
         seen[:, :] = ids.T
@@ -158,91 +159,55 @@ def _show(
     rectangles: Rectangles,
     faces: Faces | None,
     work: Work,
-    bent: Bent | None,
-    view: View,
-    axes: Pose,
-    camera: Vec,
-    bounds: NDArray[np.float64],
-    shape: NDArray[np.int8],
-    center: NDArray[np.float64],
-    half_size: NDArray[np.float64],
-    yaw: NDArray[np.float64],
+    optics: Optics,
+    scene: Scene,
     meshes: Meshes | None,
-    texture: NDArray[np.int8],
-    per_m: NDArray[np.float32],
-    offset: NDArray[np.float32],
-    albedo: NDArray[np.float32],
+    look: Look,
     gloss: Gloss | None,
-    lights: NDArray[np.float32],
-    atlas: Plane,
 ) -> None:
-    """Write the colours of what `draw_bodies` has drawn; arguments as of `render_colour`.
+    """Write the colours of what `draw_bodies` has drawn.
 
     `far` (n, m) is depth [m], `ids` what each pixel sees (hills become floor), `rectangles`
-    (obstacles + meshes, 3, 4) where bodies were drawn, `faces` (n, m) the meshes' triangles,
-    `camera` (3,) NED [m] above the ground.
+    (obstacles + meshes, 3, 4) where bodies were drawn, `faces` (n, m) the meshes' triangles;
+    `gloss` is that of `look`.
     """
-    lines, xs = work.lines, work.xs
-    light = _lit(lights)
-    lit, clear, out, points, rays = work.lit, work.clear, work.out, work.points, work.rays
-    surfaces.write_rays(rays, lines, xs, bent, axes)
-    to_sun = (float(lights[0, 0]), float(lights[0, 1]), float(lights[0, 2]))
-    count = ids.size
-    all_ids, all_far = ids.reshape(count), far.reshape(count)
-    all_lit, all_clear = lit.reshape(count), clear.reshape(count)
-    extinction = float(light.extinction)
-    through = let_through(gloss, WALLS_ROW)
-    shade_by_walls(all_lit, all_clear, all_far, rays, camera, bounds, to_sun, extinction, through)
+    camera, view, light, count = optics.camera, optics.lens, look.light, ids.size
+    lit, out, rays = work.lit, work.out, work.rays
+    canvas = Canvas(
+        out, ids.reshape(count), far.reshape(count), lit.reshape(count),
+        work.clear.reshape(count), rays, work.points,
+    )  # fmt: skip
+    surfaces.write_rays(rays, optics)
+    to_sun = (float(light.to_sun[0]), float(light.to_sun[1]), float(light.to_sun[2]))
+    shade_by_walls(
+        canvas, camera, scene.bounds, to_sun, float(light.extinction), let_through(gloss, WALLS_ROW)
+    )
+    shadows = Shaded(lit, far, ids, work.corners)
     sunny = max(max(light.sun[0], light.sun[1]), light.sun[2]) > ZERO
-    for i in range(len(shape)):
+    for i in range(len(scene.shape)):
         if sunny:
             if is_owned(meshes, i):
                 continue
-            world, half = _placed(axes, camera, center, half_size, i)
-            shade_by_obstacle(
-                lit, far, ids, work.corners, i, lines, xs, bent, view, world, camera, shape[i],
-                half, yaw[i], to_sun, let_through(gloss, OBSTACLE_ROW + i),
-            )  # fmt: skip
+            body = body_of(scene, optics.axes, camera, i)
+            shade_by_obstacle(shadows, optics, body, to_sun, let_through(gloss, OBSTACLE_ROW + i))
     if meshes is not None and faces is not None and sunny:
-        shade_by_meshes(
-            lit, far, ids, faces, work.corners, lines, xs, bent, view, axes, camera, meshes, to_sun,
-            gloss,
-        )  # fmt: skip
-    surfaces.draw_sky(out, all_ids, points, rays, camera, light)
-    pixel2 = F32(1.0 / (view.focal * view.focal))
-    floor = surface_of(texture, per_m, offset, albedo, FLOOR_ROW)
-    walls = surface_of(texture, per_m, offset, albedo, WALLS_ROW)
-    surfaces.shade_floor(
-        out, all_ids, all_far, all_lit, all_clear, points, rays, camera, floor, light, atlas, pixel2
-    )
-    surfaces.shade_walls(
-        out, all_ids, all_far, all_lit, all_clear, points, rays, camera, walls, light, atlas, pixel2
-    )
+        shade_by_meshes(shadows, optics, meshes, faces, to_sun, gloss)
+    surfaces.draw_sky(canvas, camera, light)
+    surfaces.shade_floor(canvas, look, camera)
+    surfaces.shade_walls(canvas, look, camera)
     if meshes is not None and faces is not None:
-        shade_meshes(
-            out, all_ids, all_far, all_lit, all_clear, points, rectangles, meshes,
-            faces.reshape(count), lines, xs, bent, axes, camera, texture, per_m, offset, albedo,
-            light, atlas, pixel2,
-        )  # fmt: skip
-    for i in range(len(shape)):
+        surfaces.shade_meshes(canvas, look, optics, rectangles, meshes, faces.reshape(count))
+    for i in range(len(scene.shape)):
         if is_owned(meshes, i):
             continue
-        world, half = _placed(axes, camera, center, half_size, i)
-        surface = surface_of(texture, per_m, offset, albedo, OBSTACLE_ROW + i)
+        body = body_of(scene, optics.axes, camera, i)
         for k in range(3 if view.cylindrical else 1):
-            surfaces.shade_obstacle(
-                out, all_ids, all_far, all_lit, all_clear, points, rectangles[i, k], i, lines, xs,
-                bent, world, shape[i], half, yaw[i], surface, light, atlas, pixel2,
-            )  # fmt: skip
+            surfaces.shade_obstacle(canvas, look, optics, body, rectangles[i, k])
     if gloss is not None:
-        look = Look(texture, per_m, offset, albedo, gloss, light, atlas, pixel2)
-        draw_reflections(
-            out, all_ids, rays, camera, bounds, shape, center, half_size, yaw, meshes, look
-        )
-    if bent is not None:
-        _blacken(out, bent)
+        draw_reflections(out, canvas.ids, rays, camera, scene, meshes, look)
+    _blacken(out, optics.bent)
     unpack(rgb, out, view.cylindrical)
-    _tell_ground(all_ids, meshes)
+    _tell_ground(canvas.ids, meshes)
 
 
 @borrowing_kernel
@@ -255,24 +220,16 @@ def _tell_ground(ids: Ids, meshes: Meshes | None) -> None:
 
 
 @borrowing_kernel
-def _blacken(out: Packed, bent: Bent) -> None:
+def _blacken(out: Packed, bent: Bent | None) -> None:
     """Write black where a fisheye's pixels see nothing at all."""
+    if bent is None:
+        return
     n, m = bent.forward.shape
     for v in range(n):
         for u in range(m):
             i, j, k = bent.forward[v, u], bent.across[v, u], bent.along[v, u]
             if i == 0.0 and j == 0.0 and k == 0.0:
                 out[v * m + u] = np.int32(0)
-
-
-@borrowing_kernel
-def _placed(
-    axes: Pose, camera: Vec, center: NDArray[np.float64], half_size: NDArray[np.float64], i: int
-) -> tuple[Pose, Vec]:
-    """Return the camera's axes with an obstacle's centre from the camera, and its half size."""
-    offset = (center[i, 0] - camera[0], center[i, 1] - camera[1], center[i, 2] - camera[2])
-    half = (half_size[i, 0], half_size[i, 1], half_size[i, 2])
-    return Pose(axes.forward, axes.across, axes.along, offset), half
 
 
 @borrowing_kernel

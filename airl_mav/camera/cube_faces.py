@@ -1,6 +1,6 @@
 """An image with any rays, resampled from pinhole images of the faces of a cube about the camera.
 
-For renderers that have pinholes alone. A pixel is divided into `side` x `side` places; each has a
+For renderers that have pinholes alone. A pixel is divided into `side` x `side` places. Each has a
 ray, which leaves the cube through one face, and takes what the nearest pixel of that face shows.
 Only faces, and of them only the rectangles, that a ray goes through are rendered.
 """

@@ -66,7 +66,7 @@ class PathTraced:
         quaternion: Quat | NDArray[np.float64],
         number: int = 0,
     ) -> NDArray[Any]:
-        """Return the image; see `expose`. Raises as `mitsuba.path_traced`."""
+        """Return the image; see `expose`. Raises as `mitsuba.PathTracer`."""
         pose = np.asarray(position), np.asarray(quaternion)
         seed = (self._first + number) % _SEEDS
         rgb = self._tracer(arena, centers, intrinsics, *pose, seed=seed)

@@ -66,10 +66,7 @@ def velocities_of(arena: Arena, elapsed_us: int) -> Floats:
 def optical_flow(
     picture: Picture, camera: Intrinsics, motion: CameraMotion, velocities: Floats
 ) -> NDArray[np.float32]:
-    """Return the flow (h, w, 2) of a picture [px/s]; NaN where a fisheye sees nothing.
-
-    `velocities` (n, 3) are those of the obstacles NED [m/s].
-    """
+    """Return the flow (h, w, 2) of a picture [px/s], NaN where a fisheye sees nothing."""
     rays = rays_of(camera)
     axes = quat_to_matrix(motion.quaternion)
     depth = picture.depth_m.astype(np.float64)

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.errors import UsageError
-from airl_mav.profiles.camera_kind import CameraKind, shape_of
+from airl_mav.profiles.camera_kind import CameraKind, Projection, shape_of
 from airl_mav.profiles.distortion import MOST_COEFFICIENT, UNDISTORTED, Distortion
-from airl_mav.profiles.projection import Projection
 
 _MODES: Final = {1: "L", 3: "RGB"}
 
@@ -327,10 +326,7 @@ def rgb_of(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def nearness(depth_mm: NDArray[Any], range_m: float) -> NDArray[np.float64]:
-    """Return the nearness of depth [mm]: 1 at the camera or without return, 0 at a range [m].
-
-    A square root, which shows near things best.
-    """
+    """Return the root of nearness of depth [mm]: 1 at the camera, 0 at a range [m]."""
     near: NDArray[np.float64] = 1.0 - np.sqrt(np.clip(depth_mm / (MM_PER_M * range_m), 0.0, 1.0))
     return near
 

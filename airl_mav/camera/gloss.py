@@ -98,7 +98,7 @@ def _visible(alpha: float, cosine: float) -> float:
 def highlight(alpha: float, normal: Vec, ray: Vec, to_sun: Vec) -> tuple[float, float]:
     """Return radiance per irradiance of the sun on a rough white surface, and the facets' cosine.
 
-    `alpha` is the width of the slopes; the vectors are unit vectors. The cosine gives Fresnel's
+    `alpha` is the width of the slopes. The vectors are unit vectors. The cosine gives Fresnel's
     share.
     """
     sun, eye = dot(normal, to_sun), -dot(normal, ray)

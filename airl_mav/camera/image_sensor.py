@@ -44,18 +44,12 @@ def vignette(camera: Intrinsics, share: float) -> Light:
 def noisy(
     light: Light, gain: float, full_well_e: float, read_noise_e: float, rng: np.random.Generator
 ) -> Light:
-    """Return light as a photon-counting sensor measures it.
+    """Return light (...) as a photon-counting sensor measures it.
 
-    A pixel that reads x holds N = x full_well_e / max(gain, 1) electrons: a gain above 1 multiplies
+    A pixel that reads x holds N = x full_well_e / max(gain, 1) electrons. A gain above 1 multiplies
     what was counted, one below 1 is a darker exposure. Their number has the variance N (Poisson's,
     in its normal approximation), reading it adds read_noise_e² (EMVA 1288, release 4.0, section 2).
-
-    Args:
-        light: (...) without noise, after the gain; above 1 the sensor is full.
-        gain: Of the light.
-        full_well_e: Electrons of a white pixel at a gain of 1.
-        read_noise_e: Standard deviation of reading [electrons].
-        rng: Generator.
+    The light is after the gain. Above 1 the sensor is full.
     """
     full = np.minimum(light, np.float32(1.0))
     per_light = full_well_e / max(gain, 1.0)

@@ -1,7 +1,7 @@
 """How a colour camera's image is formed: exposed while the vehicle moves, metered, noisy, coded.
 
 An exposure that takes time is the mean of images of shorter ones, from where vehicle and obstacles
-are then: its middle is the frame's stamp, and velocity and angular rates are those of that moment.
+are then. Its middle is the frame's stamp, and velocity and angular rates are those of that moment.
 With a rolling shutter the rows are exposed one after the other, the first at the top, and the stamp
 is the middle of the middle row's exposure.
 A gain is light: the scene is drawn with all light times the gain, so that dark ones keep their
@@ -74,18 +74,10 @@ class ImageFormation:
         self._frame = 0
 
     def take(self, arena: Arena, elapsed_us: int, motion: Motion, seed: int, frame: int) -> Taken:
-        """Return an image.
+        """Return an image in the middle of its exposure and rows, `elapsed_us` after the start.
 
-        Args:
-            arena: The arena.
-            elapsed_us: Time since the episode's start, at the middle of the exposure and of the
-                rows [µs].
-            motion: Motion of the vehicle then.
-            seed: Seed of the episode.
-            frame: Number in the episode by the camera's rate, skipped frames included.
-
-        Raises:
-            UsageError: A mesh's file is missing or has changed.
+        `motion` is the vehicle's then, `seed` the episode's, `frame` the number by the camera's
+        rate, skipped frames included. Raises UsageError if a mesh's file is missing or has changed.
         """
         asked = self._imaging
         off = _off_by(asked, seed, self._own)

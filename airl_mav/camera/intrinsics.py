@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from airl_mav.profiles.camera_kind import CameraKind, shape_of
+from airl_mav.profiles.camera_kind import CameraKind, Projection, shape_of
 from airl_mav.profiles.distortion import UNDISTORTED, Distortion, distorted, sees_to, undistorted
-from airl_mav.profiles.projection import Projection
 
 if TYPE_CHECKING:  # A frame source needs no models of profiles.
     from airl_mav.profiles.camera import Camera
@@ -32,7 +31,7 @@ class Intrinsics:
       that of a pinhole of the same focal length.
     - fisheye: (sin b cos c, sin b sin c, cos b), at the angle b [rad] from the optical axis that
       `profiles.distortion` makes r / focal of, where r is the way from (cx, cy) to the pixel and c
-      its direction; without coefficients b is r / focal, equidistant. Depth is measured along that
+      its direction. Without coefficients b is r / focal, equidistant. Depth is measured along that
       unit vector. Pixels more than 95 degrees from the axis see nothing, nor do those beyond the
       angle to which the coefficients hold.
 

@@ -1,6 +1,6 @@
 """Rain on the lens: drops that show the scene upside down, small and out of focus.
 
-A drop is a strong lens, too near to be sharp: it shows its surroundings upside down with a soft
+A drop is a strong lens, too near to be sharp. It shows its surroundings upside down with a soft
 edge (Porav, Bruls and Newman, I can see clearly now: image restoration via de-raining, ICRA 2019).
 Here it is an ellipse with an edge blurred by `_SOFT`, whose point at (a, b), in its own half axes,
 shows the mean of nine points around (-a, -b) of `_REACH` of the image's width.

@@ -2,7 +2,7 @@
 
 A triangle with the corners a, b and c, seen from the camera, is hit by the ray d where the volumes
 d.(b x c), d.(c x a) and d.(a x b) have one sign, but for rounding, so that no ray passes between
-two that share an edge or a corner: each is affine along a line of the image. The inverse depth is
+two that share an edge or a corner. Each is affine along a line of the image. The inverse depth is
 n.d / n.a with n = (b - a) x (c - a). Both sides are seen.
 """
 
@@ -14,8 +14,19 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.camera.primitives import Ids, Line, Lines
-from airl_mav.camera.projection import Image, Pose, Rectangle, Span, View, cut, cylinder_span, dot
+from airl_mav.camera.primitives import Ids
+from airl_mav.camera.projection import (
+    Image,
+    Line,
+    Lines,
+    Pose,
+    Rectangle,
+    Span,
+    View,
+    cut,
+    cylinder_span,
+    dot,
+)
 from airl_mav.core.kernels import borrowing_kernel, kernel
 from airl_mav.vehicle.rotation import Vec
 

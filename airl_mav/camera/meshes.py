@@ -1,17 +1,18 @@
 """The inverse depth of a mesh along the lines of an image: its tree, walked by all rays together.
 
 All rays of an image begin in one place, so a node of the tree is tested against all of them at
-once: the rays that may hit it are those of the rectangle that its box projects to, cut to that of
+once. The rays that may hit it are those of the rectangle that its box projects to, cut to that of
 its parent. A node is passed over where no ray goes through its rectangle, as most are of a fine
 mesh seen from afar, or where all of its rays have been stopped nearer. Near nodes come before far
 ones. Where one ray is left, it alone goes on through the tree. Of a fisheye, whose rays are affine
 along no line, each goes through the tree alone from the beginning.
 
-Which pixels a box projects to is `mesh_parts`, what a ray does with a triangle `mesh_triangles`.
+Which pixels a box projects to and what a ray does with a triangle are `mesh_triangles`.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 import numpy as np
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 from airl_mav.camera import projection
 from airl_mav.camera.bvh import STACK, Bvh, Meshes
 from airl_mav.camera.mesh_triangles import Faces, draw_triangle, met, part_of
-from airl_mav.camera.primitives import OBSTACLE, Ids, Line, Lines, Rectangles, turned
+from airl_mav.camera.primitives import OBSTACLE, Ids, Rectangles, turned
 from airl_mav.core.kernels import borrowing_kernel, kernel, large_borrowing_kernel, large_kernel
 from airl_mav.vehicle.rotation import Vec
 
@@ -32,10 +33,9 @@ _MOST_LOOKED_AT: Final = 256
 
 
 @borrowing_kernel
-def seen_from(
-    axes: projection.Pose, camera: Vec, pose: NDArray[np.float64], k: int
-) -> projection.Pose:
+def seen_from(optics: projection.Optics, pose: NDArray[np.float64], k: int) -> projection.Pose:
     """Return the camera's axes along mesh k's, and its origin from the camera, in units of it."""
+    axes, camera = optics.axes, optics.camera
     per = 1.0 / pose[k, 4]
     offset = (pose[k, 0] - camera[0], pose[k, 1] - camera[1], pose[k, 5] - camera[2])
     at = (per * offset[0], per * offset[1], per * offset[2])
@@ -50,36 +50,23 @@ def draw_meshes(
     ids: Ids | None,
     faces: Faces | None,
     drawn_in: Rectangles | None,
-    lines: Lines,
-    xs: Line,
+    optics: projection.Optics,
     bent: projection.Bent | None,
-    view: projection.View,
-    axes: projection.Pose,
-    camera: Vec,
     meshes: Meshes,
 ) -> None:
     """Draw the meshes of an arena over what has been drawn; arguments as of `raycast.draw_bodies`.
 
-    `ids`, `faces` and `drawn_in` are None together; `drawn_in` is written behind the obstacles, in
-    the first place of each mesh.
+    `bent` is that of `optics`. `ids`, `faces` and `drawn_in` are None together; `drawn_in` is
+    written behind the obstacles, in the first place of each mesh.
     """
     waiting = np.empty((STACK, 5), np.int32)
     nearest = np.empty(STACK)
     for k in range(len(meshes.root)):
-        number = meshes.first[k]
         kept = None if drawn_in is None else drawn_in[len(meshes.owner) + k, 0]
-        pose = seen_from(axes, camera, meshes.pose, k)
-        scale = meshes.pose[k, 4]
         if bent is None:
-            _draw_mesh(
-                out, ids, faces, kept, OBSTACLE + number, lines, xs, view, pose, meshes.bvh,
-                meshes.root[k], scale, waiting, nearest,
-            )  # fmt: skip
+            _draw_mesh(out, ids, faces, kept, optics, meshes, k, waiting, nearest)
         else:
-            _cast_mesh(
-                out, ids, faces, kept, OBSTACLE + number, bent, view, pose, meshes.bvh,
-                meshes.root[k], scale, waiting,
-            )  # fmt: skip
+            _cast_mesh(out, ids, faces, kept, optics, bent, meshes, k, waiting)
 
 
 @large_borrowing_kernel
@@ -88,18 +75,16 @@ def _draw_mesh(
     ids: Ids | None,
     faces: Faces | None,
     drawn_in: Rectangles | None,
-    number: int,
-    lines: Lines,
-    xs: Line,
-    view: projection.View,
-    pose: projection.Pose,
-    bvh: Bvh,
-    root: int,
-    scale: float,
+    optics: projection.Optics,
+    meshes: Meshes,
+    k: int,
     waiting: NDArray[np.int32],
     nearest: NDArray[np.float64],
 ) -> None:
-    """Draw one mesh; `view` and `pose` are in metres and in units of the mesh."""
+    """Draw mesh k."""
+    lines, xs, view, bvh, root = optics.lines, optics.xs, optics.lens, meshes.bvh, meshes.root[k]
+    number, scale = OBSTACLE + meshes.first[k], meshes.pose[k, 4]
+    pose = seen_from(optics, meshes.pose, k)
     own = projection.View(
         view.focal, view.line_centre, view.pixel_centre, view.s_min * scale, view.cylindrical
     )
@@ -161,16 +146,16 @@ def _cast_mesh(
     ids: Ids | None,
     faces: Faces | None,
     drawn_in: Rectangles | None,
-    number: int,
+    optics: projection.Optics,
     bent: projection.Bent,
-    view: projection.View,
-    pose: projection.Pose,
-    bvh: Bvh,
-    root: int,
-    scale: float,
+    meshes: Meshes,
+    k: int,
     waiting: NDArray[np.int32],
 ) -> None:
-    """Draw one mesh with the rays of a fisheye, one by one; the rest as of `_draw_mesh`."""
+    """Draw mesh k with the rays of a fisheye, one by one; the rest as of `_draw_mesh`."""
+    view, bvh, root = optics.lens, meshes.bvh, meshes.root[k]
+    number, scale = OBSTACLE + meshes.first[k], meshes.pose[k, 4]
+    pose = seen_from(optics, meshes.pose, k)
     # Ranges, as a cylinder's depths, are no depths along the optical axis: `met` is told by this.
     own = projection.View(view.focal, view.line_centre, view.pixel_centre, view.s_min * scale, True)
     per = 1.0 / scale
@@ -242,13 +227,13 @@ def _cast(
     c, r = pose.center, pose.along
     ray = (start[0] + x * r[0], start[1] + x * r[1], start[2] + x * r[2])
     i0, i1, i2 = inverse_of(ray[0]), inverse_of(ray[1]), inverse_of(ray[2])
-    v0, v1, v2 = abs(i0), abs(i1), abs(i2)
-    c0, c1, c2 = c[0] * i0, c[1] * i1, c[2] * i2
+    begin, inverse = (c[0] * i0, c[1] * i1, c[2] * i2), (i0, i1, i2)
+    amounts = (abs(i0), abs(i1), abs(i2))
     boxes, links, corners = bvh.boxes, bvh.links, bvh.corners
     # How far the ray goes: to what it has hit, or to the end of the range.
     most = 1.0 / max(out[v, u] / per, view.s_min)
     bottom, node = tops, root
-    enter, leave = _through(boxes, node, c0, c1, c2, i0, i1, i2, v0, v1, v2)
+    enter, leave = _through(boxes, node, begin, inverse, amounts)
     if not leave >= max(enter, 0.0):
         return
     while True:
@@ -256,8 +241,8 @@ def _cast(
             first, count = links[node, 0], links[node, 1]
             if count == 0:
                 left, right = node + 1, first
-                enter, leave = _through(boxes, left, c0, c1, c2, i0, i1, i2, v0, v1, v2)
-                enter_r, leave_r = _through(boxes, right, c0, c1, c2, i0, i1, i2, v0, v1, v2)
+                enter, leave = _through(boxes, left, begin, inverse, amounts)
+                enter_r, leave_r = _through(boxes, right, begin, inverse, amounts)
                 hit = leave >= max(enter, 0.0) and enter <= most
                 hit_r = leave_r >= max(enter_r, 0.0) and enter_r <= most
                 if hit and hit_r:
@@ -286,7 +271,7 @@ def _cast(
             return
         tops -= 1
         node = waiting[tops, 0]
-        enter, leave = _through(boxes, node, c0, c1, c2, i0, i1, i2, v0, v1, v2)
+        enter, leave = _through(boxes, node, begin, inverse, amounts)
 
 
 @kernel
@@ -297,23 +282,141 @@ def inverse_of(x: float) -> float:
 
 @borrowing_kernel
 def _through(
-    boxes: NDArray[np.float32],
-    node: int,
-    c0: float,
-    c1: float,
-    c2: float,
-    i0: float,
-    i1: float,
-    i2: float,
-    v0: float,
-    v1: float,
-    v2: float,
+    boxes: NDArray[np.float32], node: int, begin: Vec, inverse: Vec, amounts: Vec
 ) -> tuple[float, float]:
     """Return where a ray enters and leaves a node's box; it misses the box if it leaves first.
 
-    `c` is the mesh's origin from the ray's start over the ray, `i` one over the ray and `v` the
-    amounts of these, along the three axes.
+    `begin` is the mesh's origin from the ray's start over the ray, `inverse` one over the ray and
+    `amounts` the amounts of these, along the three axes.
     """
-    a, b, c = c0 + boxes[node, 0] * i0, c1 + boxes[node, 1] * i1, c2 + boxes[node, 2] * i2
-    w0, w1, w2 = boxes[node, 3] * v0, boxes[node, 4] * v1, boxes[node, 5] * v2
+    a, b, c = (
+        begin[0] + boxes[node, 0] * inverse[0],
+        begin[1] + boxes[node, 1] * inverse[1],
+        begin[2] + boxes[node, 2] * inverse[2],
+    )
+    w0, w1, w2 = (
+        boxes[node, 3] * amounts[0],
+        boxes[node, 4] * amounts[1],
+        boxes[node, 5] * amounts[2],
+    )
     return max(max(a - w0, b - w1), c - w2), min(min(a + w0, b + w1), c + w2)
+
+
+# --- single rays: what stops one, and where one meets the mesh first
+
+
+@borrowing_kernel
+def _span_of(boxes: NDArray[np.float32], node: int, at: Vec, inverse: Vec) -> tuple[float, float]:
+    """Return where a ray enters and leaves a node's box; it misses if it leaves first."""
+    i0, i1, i2 = inverse
+    a, b, c = (
+        (boxes[node, 0] - at[0]) * i0,
+        (boxes[node, 1] - at[1]) * i1,
+        (boxes[node, 2] - at[2]) * i2,
+    )
+    w0, w1, w2 = boxes[node, 3] * abs(i0), boxes[node, 4] * abs(i1), boxes[node, 5] * abs(i2)
+    return max(max(a - w0, b - w1), c - w2), min(min(a + w0, b + w1), c + w2)
+
+
+@borrowing_kernel
+def stopped_by(
+    bvh: Bvh,
+    root: int,
+    at: Vec,
+    sun: Vec,
+    inverse: Vec,
+    least: float,
+    last: int,
+    waiting: NDArray[np.int32],
+) -> int:
+    """Return a triangle beyond `least` between a point and the sun; -1 = none.
+
+    Arguments as of `distance_to`; `inverse` (3,) is one over `sun`, and `last` the triangle that
+    hid the previous point, tested first.
+    """
+    if last >= 0 and _stops(bvh.corners, last, at, sun, least):
+        return last
+    boxes, links = bvh.boxes, bvh.links
+    tops, node = 0, root
+    while True:
+        enter, leave = _span_of(boxes, node, at, inverse)
+        if leave >= max(enter, least):
+            count = links[node, 1]
+            if count == 0:
+                waiting[tops] = links[node, 0]
+                tops += 1
+                node += 1
+                continue
+            first = links[node, 0]
+            for i in range(first, first + count):
+                if _stops(bvh.corners, i, at, sun, least):
+                    return i
+        if tops == 0:
+            return -1
+        tops -= 1
+        node = waiting[tops]
+
+
+@borrowing_kernel
+def distance_to(
+    bvh: Bvh,
+    root: int,
+    at: Vec,
+    way: Vec,
+    least: float,
+    most: float,
+    waiting: NDArray[np.int32],
+) -> tuple[float, int]:
+    """Return distance and triangle of a ray's first hit in `least`..`most`; -1 = none.
+
+    Distances are in units of the mesh, `at` (3,) from its origin; `waiting` (STACK,) is a buffer.
+    """
+    inverse = (inverse_of(way[0]), inverse_of(way[1]), inverse_of(way[2]))
+    boxes, links = bvh.boxes, bvh.links
+    tops, node, best, which = 0, root, most, -1
+    while True:
+        enter, leave = _span_of(boxes, node, at, inverse)
+        if leave >= max(enter, least) and enter <= best:
+            count = links[node, 1]
+            if count == 0:
+                waiting[tops] = links[node, 0]
+                tops += 1
+                node += 1
+                continue
+            first = links[node, 0]
+            for i in range(first, first + count):
+                distance = _distance(bvh.corners, i, at, way)
+                if least <= distance < best:
+                    best, which = distance, i
+        if tops == 0:
+            return best, which
+        tops -= 1
+        node = waiting[tops]
+
+
+@borrowing_kernel
+def _stops(corners: NDArray[np.float32], i: int, at: Vec, way: Vec, least: float) -> bool:
+    """Return whether a ray hits a triangle, from either side, no nearer than `least`."""
+    return _distance(corners, i, at, way) >= least
+
+
+@borrowing_kernel
+def _distance(corners: NDArray[np.float32], i: int, at: Vec, way: Vec) -> float:
+    """Return the distance of a triangle along a ray, or minus infinity (Moller, Trumbore, 1997)."""
+    p0, p1, p2 = float(corners[i, 0]), float(corners[i, 1]), float(corners[i, 2])
+    a0, a1, a2 = corners[i, 3] - p0, corners[i, 4] - p1, corners[i, 5] - p2
+    b0, b1, b2 = corners[i, 6] - p0, corners[i, 7] - p1, corners[i, 8] - p2
+    h0, h1, h2 = way[1] * b2 - way[2] * b1, way[2] * b0 - way[0] * b2, way[0] * b1 - way[1] * b0
+    volume = a0 * h0 + a1 * h1 + a2 * h2
+    if volume == 0.0:
+        return -math.inf
+    per = 1.0 / volume
+    s0, s1, s2 = at[0] - p0, at[1] - p1, at[2] - p2
+    u = per * (s0 * h0 + s1 * h1 + s2 * h2)
+    if u < 0.0 or u > 1.0:
+        return -math.inf
+    q0, q1, q2 = s1 * a2 - s2 * a1, s2 * a0 - s0 * a2, s0 * a1 - s1 * a0
+    v = per * (way[0] * q0 + way[1] * q1 + way[2] * q2)
+    if v < 0.0 or u + v > 1.0:
+        return -math.inf
+    return float(per * (b0 * q0 + b1 * q1 + b2 * q2))

@@ -38,32 +38,11 @@ _SEEDS = 1 << 32
 """Numbers of seeds that Mitsuba tells from each other."""
 
 
-def path_traced(
-    arena: Arena,
-    centers: Floats,
-    intrinsics: Intrinsics,
-    position: Floats,
-    quaternion: Floats,
-    *,
-    samples: int,
-    seed: int = 0,
-) -> NDArray[np.uint8]:
-    """Return the sRGB image of an arena by Mitsuba's path tracer; arguments as of `render.render`.
-
-    `samples` are paths per pixel, approximate off the middle of a cylinder or fisheye.
-
-    Raises:
-        UsageError: The arena has fog.
-        ImportError: Mitsuba is not installed: the extra `render`.
-    """
-    return PathTracer(samples)(arena, centers, intrinsics, position, quaternion, seed)
-
-
 class PathTracer:
     """Draws images, and keeps the scene of the last one for as long as nothing in it moves."""
 
     def __init__(self, samples: int) -> None:
-        """Trace so many paths a pixel."""
+        """Trace so many paths a pixel, about as many off the middle of a cylinder or fisheye."""
         self._samples = samples
         self._arena: Arena | None = None
         self._centers: Floats = np.zeros((0, 3))
@@ -79,7 +58,10 @@ class PathTracer:
         quaternion: Floats,
         seed: int,
     ) -> NDArray[np.uint8]:
-        """Return the image; see `path_traced`."""
+        """Return the sRGB image of an arena; arguments as of `render.render`.
+
+        Raises UsageError for an arena with fog, ImportError without Mitsuba (the extra `render`).
+        """
         if arena.look.light.extinction > 0.0:
             raise UsageError("renderer mitsuba: accepted: an arena without appearance.fog")
         import mitsuba as mi
@@ -318,7 +300,7 @@ def _sphere(mi: Any, finish: Finish, row: int, center: Floats, radius: float) ->
 
 
 def _mesh(mi: Any, finish: Finish, row: int, placed: PlacedMesh) -> Any:
-    """Return a mesh of flat triangles. Its pattern lies on them as `mesh_surfaces` has it."""
+    """Return a mesh of flat triangles. Its pattern is that of `surfaces.shade_meshes`."""
     vertices, faces = standing(placed)
     corners = placed.scale * triangles_of(placed.file).corners.astype(np.float64)
     return _triangles(mi, finish, row, corners, vertices[faces])
@@ -332,7 +314,7 @@ def _hills(mi: Any, finish: Finish, ground: Ground) -> Any:
 
 
 def _triangles(mi: Any, finish: Finish, row: int, corners: Floats, placed: Floats) -> Any:
-    """Return flat triangles with a pattern as in `mesh_surfaces`.
+    """Return flat triangles with a pattern as in `surfaces.shade_meshes`.
 
     `corners` (m, 3, 3) are along the mesh's axes, `placed` (m, 3, 3) NED [m]; `row` is the
     material.

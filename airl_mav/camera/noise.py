@@ -1,9 +1,9 @@
 """What makes a depth camera's images differ from the truth: how it measures, and conditions.
 
-The image is that of the left imager. Depth is focal length times baseline over disparity: an error
+The image is that of the left imager. Depth is focal length times baseline over disparity. An error
 of the disparity grows with the square of the depth, its steps are coarse far away, and the greatest
 disparity that is searched sets the least depth. What the right imager does not see has no match and
-no return: something nearer hides it, or it lies outside of its image.
+no return. Something nearer hides it, or it lies outside of its image.
 (Grunnet-Jepsen, Sweetser, Woodfill, "Tuning depth cameras for best performance", Intel RealSense;
 Luxonis, "Configuring Stereo Depth".)
 """

@@ -13,10 +13,10 @@ from airl_mav.arena.appearance import Drawn, linear_of, srgb_of
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.bvh import meshes_of
 from airl_mav.camera.colour import Work, render_colour
-from airl_mav.camera.fisheye import bent_of
 from airl_mav.camera.gloss import Gloss
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.lens_drops import rained_on
+from airl_mav.camera.projection import bent_of
 from airl_mav.camera.rays import finer
 from airl_mav.camera.textures import atlas, mean_of, periods
 from airl_mav.core.kernels import kernel
@@ -77,10 +77,7 @@ def render_picture(
     quaternion: Quat | NDArray[np.float64],
     gain: float = 1.0,
 ) -> Picture:
-    """Return the colour image, unlimited depth and what is seen; arguments as of `render`.
-
-    All light is multiplied by `gain` before quantization.
-    """
+    """Return the picture of an arena, light times `gain`; arguments as of `render`."""
     k, obstacles, look = intrinsics, arena.obstacles, ColourArrays.of(arena.look)
     shape = (k.height, k.width)
     # Tuples and arrays of the types that the batch twin hands over: one compiled kernel for both.

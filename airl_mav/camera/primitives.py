@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Shape
-from airl_mav.camera.projection import Bent, Image, Pose, Rectangle, View, dot, ray_of
+from airl_mav.camera.projection import Body, Image, Optics, Pose, Rectangle, dot, ray_of
 from airl_mav.core.kernels import borrowing_kernel, kernel
 from airl_mav.vehicle.rotation import Vec
 
@@ -30,11 +30,8 @@ OBSTACLE: Final = 4
 _UNLIMITED: Final = 1e30  # inverse depth of an entry that lies behind the camera
 TINY: Final = 1e-9  # least distance to a plane [m], least range [1/m]; keeps inverses finite
 
-Line = NDArray[np.float64]
 Ids = NDArray[np.int32]
 Rectangles = NDArray[np.int32]
-Lines = NDArray[np.float64]
-"""(n, 2) how much of the forward axis, and of the axis across, is in the first ray of a line."""
 
 
 class _Slab(NamedTuple):
@@ -74,15 +71,7 @@ def _line_start(pose: Pose, ahead: float, y: float) -> Vec:
 
 @borrowing_kernel
 def draw_room(
-    out: Image,
-    ids: Ids | None,
-    lines: Lines,
-    xs: Line,
-    bent: Bent | None,
-    view: View,
-    pose: Pose,
-    half: Vec,
-    closed: bool,
+    out: Image, ids: Ids | None, optics: Optics, pose: Pose, half: Vec, closed: bool
 ) -> None:
     """Write inverse depth of floor, walls and ceiling, 0 = no return, and in `ids` what is seen.
 
@@ -90,7 +79,7 @@ def draw_room(
     one that enters by the lid sees the inside, any other that enters sees a wall from outside.
     Where it is closed, either sees the lid.
     """
-    c = pose.center
+    c, lines, xs = pose.center, optics.lines, optics.xs
     north = _slab(c[0] - half[0], c[0] + half[0])
     east = _slab(c[1] - half[1], c[1] + half[1])
     floor, top = 1.0 / (c[2] + half[2]), c[2] - half[2]
@@ -99,7 +88,7 @@ def draw_room(
     enter_gain, enter_base, exit_gain = (lid, 0.0, 0.0) if above else (0.0, _UNLIMITED, lid)
     covered, lid_seen = closed and above, 1.0 if closed else 0.0
     if north.enter_base > 0.0 and east.enter_base > 0.0 and not above:
-        _draw_room_around(out, ids, lines, xs, bent, view, pose, north, east, floor, lid, lid_seen)
+        _draw_room_around(out, ids, optics, pose, north, east, floor, lid, lid_seen)
         return
     for v in range(out.shape[0]):
         start = _line_start(pose, lines[v, 0], lines[v, 1])
@@ -107,7 +96,7 @@ def draw_room(
         if ids is not None:
             marks = ids[v]
         for u in range(len(xs)):
-            n, e, d = ray_of(pose, bent, v, u, start, xs[u])
+            n, e, d = ray_of(pose, optics.bent, v, u, start, xs[u])
             by_side = min(
                 north.enter_gain * n + north.enter_base, east.enter_gain * e + east.enter_base
             )
@@ -122,7 +111,7 @@ def draw_room(
             s = by_side if by_side < by_lid else inner
             enters = min(by_side, by_lid) >= max(leave, leave_lid)
             s = s if enters else 0.0
-            s = s if s >= view.s_min else 0.0
+            s = s if s >= optics.lens.s_min else 0.0
             row[u] = s
             if ids is not None:
                 inwards = by_side < by_lid
@@ -142,10 +131,7 @@ def draw_room(
 def _draw_room_around(
     out: Image,
     ids: Ids | None,
-    lines: Lines,
-    xs: Line,
-    bent: Bent | None,
-    view: View,
+    optics: Optics,
     pose: Pose,
     north: _Slab,
     east: _Slab,
@@ -158,20 +144,21 @@ def _draw_room_around(
     `north` and `east` are slabs between walls, `floor` and `lid` inverse depths below and,
     negative, above the camera [1/m]; `lid_seen` is 1 for a ceiling, 0 for an open room.
     """
+    lines, xs = optics.lines, optics.xs
     for v in range(out.shape[0]):
         start = _line_start(pose, lines[v, 0], lines[v, 1])
         row = out[v]
         if ids is not None:
             marks = ids[v]
         for u in range(len(xs)):
-            n, e, d = ray_of(pose, bent, v, u, start, xs[u])
+            n, e, d = ray_of(pose, optics.bent, v, u, start, xs[u])
             norths = max(north.exit_a * n, north.exit_b * n)
             easts = max(east.exit_a * e, east.exit_b * e)
             walls, by_floor, by_lid = max(norths, easts), floor * d, lid * d
             leave = max(walls, by_floor)
             by_top = leave < by_lid
             s = lid_seen * by_lid if by_top else leave
-            s = s if s >= view.s_min else 0.0
+            s = s if s >= optics.lens.s_min else 0.0
             row[u] = s
             if ids is not None:
                 wall = WALL_NORTH_SOUTH if norths >= easts else WALL_EAST_WEST
@@ -181,64 +168,44 @@ def _draw_room_around(
 
 
 @borrowing_kernel
-def draw_box(
-    out: Image,
-    ids: Ids | None,
-    number: int,
-    lines: Lines,
-    xs: Line,
-    bent: Bent | None,
-    view: View,
-    pose: Pose,
-    half: Vec,
-    rectangle: Rectangle,
-) -> bool:
+def draw_box(out: Image, ids: Ids | None, optics: Optics, body: Body, rectangle: Rectangle) -> bool:
     """Draw a box; return whether the camera is inside."""
-    c = pose.center
+    c, half, lines = body.pose.center, body.half, optics.lines
     i = _slab(c[0] - half[0], c[0] + half[0])
     j = _slab(c[1] - half[1], c[1] + half[1])
     k = _slab(c[2] - half[2], c[2] + half[2])
     if i.enter_base > 0.0 and j.enter_base > 0.0 and k.enter_base > 0.0:
         return True
     top, bottom, left, end = rectangle
-    x_span = xs[left:end]
+    x_span = optics.xs[left:end]
     for v in range(top, bottom):
-        start = _line_start(pose, lines[v, 0], lines[v, 1])
+        start = _line_start(body.pose, lines[v, 0], lines[v, 1])
         row = out[v, left:end]
         if ids is not None:
             marks = ids[v, left:end]
         for u in range(len(x_span)):
-            a, b, d = ray_of(pose, bent, v, left + u, start, x_span[u])
+            a, b, d = ray_of(body.pose, optics.bent, v, left + u, start, x_span[u])
             enter = min(
                 i.enter_gain * a + i.enter_base,
                 min(j.enter_gain * b + j.enter_base, k.enter_gain * d + k.enter_base),
             )
             leave = max(
                 max(max(i.exit_a * a, i.exit_b * a), max(j.exit_a * b, j.exit_b * b)),
-                max(max(k.exit_a * d, k.exit_b * d), view.s_min),
+                max(max(k.exit_a * d, k.exit_b * d), optics.lens.s_min),
             )
             s = enter if enter >= leave else 0.0
             if ids is not None:
-                marks[u] = number if s > row[u] else marks[u]
+                marks[u] = OBSTACLE + body.number if s > row[u] else marks[u]
             row[u] = max(row[u], s)
     return False
 
 
 @borrowing_kernel
 def draw_cylinder(
-    out: Image,
-    ids: Ids | None,
-    number: int,
-    lines: Lines,
-    xs: Line,
-    bent: Bent | None,
-    view: View,
-    pose: Pose,
-    half: Vec,
-    rectangle: Rectangle,
+    out: Image, ids: Ids | None, optics: Optics, body: Body, rectangle: Rectangle
 ) -> bool:
     """Draw a vertical cylinder with caps; return whether the camera is inside."""
-    c = pose.center
+    c, half, lines = body.pose.center, body.half, optics.lines
     k = _slab(c[2] - half[2], c[2] + half[2])
     # Side: (c.c - radius²) s² - 2 (d.c) s + d.d = 0, horizontal components only.
     cc = c[0] * c[0] + c[1] * c[1] - half[0] * half[0]
@@ -248,64 +215,55 @@ def draw_cylinder(
     out_gain = 1.0 / max(cc, TINY * TINY) if outside else 1.0 / min(cc, -TINY * TINY)
     in_gain, in_base = (out_gain, 0.0) if outside else (0.0, _UNLIMITED)
     top, bottom, left, end = rectangle
-    x_span = xs[left:end]
+    x_span = optics.xs[left:end]
     for v in range(top, bottom):
-        start = _line_start(pose, lines[v, 0], lines[v, 1])
+        start = _line_start(body.pose, lines[v, 0], lines[v, 1])
         row = out[v, left:end]
         if ids is not None:
             marks = ids[v, left:end]
         for u in range(len(x_span)):
-            a, b, d = ray_of(pose, bent, v, left + u, start, x_span[u])
+            a, b, d = ray_of(body.pose, optics.bent, v, left + u, start, x_span[u])
             toward = a * c[0] + b * c[1]
             square = toward * toward - cc * (a * a + b * b)
             root = math.sqrt(max(square, 0.0))
             enter = min(in_gain * (toward + root) + in_base, k.enter_gain * d + k.enter_base)
             leave = max(
-                max(out_gain * (toward - root), view.s_min), max(k.exit_a * d, k.exit_b * d)
+                max(out_gain * (toward - root), optics.lens.s_min), max(k.exit_a * d, k.exit_b * d)
             )
             s = enter if enter >= leave else 0.0
             s = s if square >= 0.0 else 0.0
             if ids is not None:
-                marks[u] = number if s > row[u] else marks[u]
+                marks[u] = OBSTACLE + body.number if s > row[u] else marks[u]
             row[u] = max(row[u], s)
     return False
 
 
 @borrowing_kernel
 def draw_sphere(
-    out: Image,
-    ids: Ids | None,
-    number: int,
-    lines: Lines,
-    xs: Line,
-    bent: Bent | None,
-    view: View,
-    pose: Pose,
-    radius: float,
-    rectangle: Rectangle,
+    out: Image, ids: Ids | None, optics: Optics, body: Body, rectangle: Rectangle
 ) -> bool:
     """Draw a sphere; return whether the camera is inside."""
-    c = pose.center
+    c, radius, lines = body.pose.center, body.half[0], optics.lines
     cc = dot(c, c) - radius * radius
     if cc <= 0.0:
         return True
     gain = 1.0 / max(cc, TINY * TINY)
     top, bottom, left, end = rectangle
-    x_span = xs[left:end]
+    x_span = optics.xs[left:end]
     for v in range(top, bottom):
-        start = _line_start(pose, lines[v, 0], lines[v, 1])
+        start = _line_start(body.pose, lines[v, 0], lines[v, 1])
         row = out[v, left:end]
         if ids is not None:
             marks = ids[v, left:end]
         for u in range(len(x_span)):
-            a, b, d = ray_of(pose, bent, v, left + u, start, x_span[u])
+            a, b, d = ray_of(body.pose, optics.bent, v, left + u, start, x_span[u])
             toward = a * c[0] + b * c[1] + d * c[2]
             square = toward * toward - cc * (a * a + b * b + d * d)
             s = gain * (toward + math.sqrt(max(square, 0.0)))
-            s = s if s >= view.s_min else 0.0
+            s = s if s >= optics.lens.s_min else 0.0
             s = s if square >= 0.0 else 0.0
             if ids is not None:
-                marks[u] = number if s > row[u] else marks[u]
+                marks[u] = OBSTACLE + body.number if s > row[u] else marks[u]
             row[u] = max(row[u], s)
     return False
 

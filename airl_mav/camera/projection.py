@@ -1,19 +1,22 @@
 """Where a body falls in the image: the pixels that bound its projection.
 
-An image is made of lines: a pinhole's are its rows, a cylinder's its columns. Along each of them a
+An image is made of lines. A pinhole's are its rows, a cylinder's its columns. Along each of them a
 pixel's ray is start + x along, affine in x, so that both are drawn by the same loops.
 """
 
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.rays import fisheye_rays
 from airl_mav.core.kernels import borrowing_kernel, kernel
-from airl_mav.profiles.distortion import Distortion, distorted
+from airl_mav.profiles.distortion import Distortion, distorted, sees_to
 from airl_mav.vehicle.rotation import Vec
 
 MIN_DEPTH_M: Final = 0.001
@@ -22,6 +25,10 @@ MIN_DEPTH_M: Final = 0.001
 _WIDE: Final = 1e9  # slope of a ray (almost) in the image plane
 
 Image = NDArray[np.float32]
+Line = NDArray[np.float64]
+Lines = NDArray[np.float64]
+"""(n, 2) how much of the forward axis, and of the axis across, is in the first ray of a line."""
+
 Rectangle = tuple[int, int, int, int]
 """Lines [first, last), pixels of each [begin, end)."""
 
@@ -60,6 +67,41 @@ class Bent(NamedTuple):
     distortion: Distortion
     sees_to: float
     """Greatest angle from the optical axis at which it sees anything [rad]."""
+
+
+class Optics(NamedTuple):
+    """The rays of an image, line by line, and the camera that they begin in."""
+
+    lines: Lines
+    xs: Line  # (m,) how much of the axis along is in each ray of a line
+    bent: Bent | None  # a fisheye's rays
+    lens: View
+    axes: Pose
+    """The camera's axes; no centre."""
+    camera: Vec
+    """Position NED, above the ground [m]."""
+
+
+class Scene(NamedTuple):
+    """The room and the n obstacles of an arena, as `render_depth` takes them."""
+
+    bounds: NDArray[np.float64]  # (6,)
+    shape: NDArray[np.int8]  # (n,)
+    center: NDArray[np.float64]  # (n, 3)
+    half_size: NDArray[np.float64]  # (n, 3)
+    yaw: NDArray[np.float64]  # (n,)
+
+
+class Body(NamedTuple):
+    """An obstacle in the world, or along its own axes."""
+
+    number: int
+    shape: int
+    half: Vec
+    """Half extents [m]; a sphere's and a cylinder's radius first."""
+    yaw: float
+    pose: Pose
+    """Camera axes, and the centre from the camera."""
 
 
 _distorted = kernel(distorted)
@@ -118,11 +160,27 @@ def _reach(axis: Vec, half: Vec, sphere: bool) -> float:
 
 
 @borrowing_kernel
+def is_pinhole(bent: Bent | None, view: View) -> bool:
+    """Return whether an image is a pinhole's."""
+    return not view.cylindrical if bent is None else False
+
+
+@borrowing_kernel
+def rectangle_of(
+    out: Image, bent: Bent | None, view: View, pose: Pose, half: Vec, sphere: bool
+) -> Rectangle:
+    """Return the pixels of a pinhole or fisheye that can see a body; see `pinhole_rectangle`."""
+    if bent is None:
+        return pinhole_rectangle(out, view, pose, half, sphere)
+    return fisheye_rectangle(out, view, bent, pose, half, sphere)
+
+
+@borrowing_kernel
 def pinhole_rectangle(out: Image, view: View, pose: Pose, half: Vec, sphere: bool) -> Rectangle:
     """Return the pixels of a pinhole that can see a body; empty when none can.
 
     `pose` has the camera's axes along the body's, and its centre, `half` the half extents of its
-    box [m]; a `sphere` has the radius half[0].
+    box [m]. A `sphere` has the radius half[0].
     """
     f, r, d, c = pose.forward, pose.along, pose.across, pose.center
     z, x, y = dot(f, c), dot(r, c), dot(d, c)
@@ -243,3 +301,16 @@ def _reached(first: float, last: float, inner: float, outer: float) -> tuple[flo
         (outer if low < 0.0 else inner) * low,
         (outer if high > 0.0 else inner) * high,
     )
+
+
+def bent_of(camera: Intrinsics) -> Bent | None:
+    """Return the rays of a camera; None: it is no fisheye."""
+    return _bent_of(camera) if camera.projection == "fisheye" else None
+
+
+@lru_cache(maxsize=64)
+def _bent_of(camera: Intrinsics) -> Bent:
+    forward, right, down = np.ascontiguousarray(fisheye_rays(camera))
+    # Numbers of one type, so that there is one compiled kernel.
+    k1, k2, k3, k4 = (float(each) for each in camera.distortion)
+    return Bent(forward, down, right, (k1, k2, k3, k4), sees_to(camera.distortion))

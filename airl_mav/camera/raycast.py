@@ -9,7 +9,7 @@ pixel of a fisheye has a ray of its own, a unit vector, and t is the range along
 Everything is done on inverse depth s = 1 / t. Of a plane it is n.d / n.(p - o): affine in the
 pixel, no division, finite for grazing rays. Of a sphere or cylinder it is a root of a quadratic.
 A convex body is hit where its last entry is no farther than its first exit. The image keeps the
-greatest s of all bodies; one division a pixel at the end turns it into metres.
+greatest s of all bodies. One division a pixel at the end turns it into metres.
 
 Obstacle-outer: an obstacle touches only the pixels of the rectangle that its bounding box or
 sphere projects to. The loops along a line have no branch, so that they vectorise. They are in
@@ -23,82 +23,101 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.camera import primitives, projection
 from airl_mav.camera.bvh import Meshes, is_owned, raised
 from airl_mav.camera.mesh_triangles import Faces
 from airl_mav.camera.meshes import draw_meshes
+from airl_mav.camera.primitives import (
+    BOX,
+    CYLINDER,
+    TINY,
+    Ids,
+    Rectangles,
+    draw_box,
+    draw_cylinder,
+    draw_room,
+    draw_sphere,
+    turned,
+)
+from airl_mav.camera.projection import (
+    MIN_DEPTH_M,
+    Bent,
+    Body,
+    Image,
+    Line,
+    Lines,
+    Optics,
+    Pose,
+    Scene,
+    View,
+    cut,
+    cylinder_span,
+    rectangle_of,
+)
 from airl_mav.core.kernels import borrowing_kernel, kernel
 from airl_mav.vehicle.rotation import Quat, Vec, rotate
 
 
 @borrowing_kernel
+def body_of(scene: Scene, axes: Pose, camera: Vec, i: int) -> Body:
+    """Return an obstacle along the axes of the world."""
+    center, half_size = scene.center, scene.half_size
+    offset = (center[i, 0] - camera[0], center[i, 1] - camera[1], center[i, 2] - camera[2])
+    half = (half_size[i, 0], half_size[i, 1], half_size[i, 2])
+    pose = Pose(axes.forward, axes.across, axes.along, offset)
+    return Body(i, scene.shape[i], half, scene.yaw[i], pose)
+
+
+@borrowing_kernel
 def _draw_obstacle(
-    out: projection.Image,
-    ids: primitives.Ids | None,
-    drawn_in: primitives.Rectangles | None,
-    number: int,
-    lines: primitives.Lines,
-    xs: primitives.Line,
-    bent: projection.Bent | None,
-    view: projection.View,
-    world: projection.Pose,
-    shape: int,
-    half: Vec,
-    yaw: float,
+    out: Image, ids: Ids | None, drawn_in: Rectangles | None, optics: Optics, body: Body
 ) -> bool:
-    """Draw one obstacle whose centre is `world.center`; return whether the camera is inside."""
+    """Draw one obstacle; return whether the camera is inside."""
     cos, sin = 1.0, 0.0
-    if shape == primitives.BOX:
-        cos, sin = math.cos(yaw), math.sin(yaw)
-    elif shape == primitives.CYLINDER:
+    shape, world, half, view = body.shape, body.pose, body.half, optics.lens
+    if shape == BOX:
+        cos, sin = math.cos(body.yaw), math.sin(body.yaw)
+    elif shape == CYLINDER:
         # Its bounding box turned towards the camera is the narrowest in the image.
         distance = math.hypot(world.center[0], world.center[1])
         if distance > 0.0:
             cos, sin = world.center[0] / distance, world.center[1] / distance
-    pose = primitives.turned(world, cos, sin)
-    sphere = shape != primitives.BOX and shape != primitives.CYLINDER
+    pose = turned(world, cos, sin)
+    sphere = shape != BOX and shape != CYLINDER
     turns = 0
     span = (0.0, 0.0, 0, 0)
     rectangle = (0, 0, 0, 0)
-    if bent is not None:
-        rectangle = projection.fisheye_rectangle(out, view, bent, pose, half, sphere)
-    elif view.cylindrical:
+    if view.cylindrical:
         # What is behind the camera may be at both ends of the image.
         turns = 1
-        span = projection.cylinder_span(out, view, pose, half, sphere)
+        span = cylinder_span(out, view, pose, half, sphere)
     else:
-        rectangle = projection.pinhole_rectangle(out, view, pose, half, sphere)
+        rectangle = rectangle_of(out, optics.bent, view, pose, half, sphere)
+    own = Body(body.number, shape, half, body.yaw, pose)
     for turn in range(-turns, turns + 1):
         if view.cylindrical:
-            rectangle = projection.cut(out, view, span, turn)
+            rectangle = cut(out, view, span, turn)
         if drawn_in is not None:
             for side in range(4):
                 drawn_in[turn + turns, side] = rectangle[side]
         if rectangle[0] >= rectangle[1] or rectangle[2] >= rectangle[3]:
             continue
         inside: bool
-        if shape == primitives.BOX:
-            inside = primitives.draw_box(
-                out, ids, number, lines, xs, bent, view, pose, half, rectangle
-            )
-        elif shape == primitives.CYLINDER:
-            inside = primitives.draw_cylinder(
-                out, ids, number, lines, xs, bent, view, pose, half, rectangle
-            )
+        if shape == BOX:
+            inside = draw_box(out, ids, optics, own, rectangle)
+        elif shape == CYLINDER:
+            inside = draw_cylinder(out, ids, optics, own, rectangle)
         else:
-            inside = primitives.draw_sphere(
-                out, ids, number, lines, xs, bent, view, pose, half[0], rectangle
-            )
+            inside = draw_sphere(out, ids, optics, own, rectangle)
         if inside:
             return True
     return False
 
 
 @borrowing_kernel
-def invert(out: projection.Image) -> None:
+def invert(out: Image) -> None:
     """Turn inverse depth into depth [m], in place."""
     zero, one = np.float32(0.0), np.float32(1.0)
-    least, most = np.float32(primitives.TINY), np.float32(1.0 / projection.MIN_DEPTH_M)
+    least, most = np.float32(TINY), np.float32(1.0 / MIN_DEPTH_M)
     for v in range(out.shape[0]):
         row = out[v]
         for u in range(len(row)):
@@ -108,7 +127,7 @@ def invert(out: projection.Image) -> None:
 
 
 @borrowing_kernel
-def blank(out: projection.Image, bent: projection.Bent) -> None:
+def blank(out: Image, bent: Bent) -> None:
     """Write 0 where a fisheye's pixels see nothing at all."""
     for v in range(out.shape[0]):
         for u in range(out.shape[1]):
@@ -119,15 +138,15 @@ def blank(out: projection.Image, bent: projection.Bent) -> None:
 
 @borrowing_kernel
 def aim(
-    lines: primitives.Lines,
-    xs: primitives.Line,
+    lines: Lines,
+    xs: Line,
     quaternion: Quat | NDArray[np.float64],
     focal: float,
     cx: float,
     cy: float,
     cylindrical: bool,
     max_range: float,
-) -> tuple[projection.View, projection.Pose]:
+) -> tuple[View, Pose]:
     """Write the rays of an image's lines; return how it sees, and its axes about no centre.
 
     `lines` (n, 2) gets the parts of the forward axis and of the axis across in each line's first
@@ -139,7 +158,7 @@ def aim(
         rotate(q, (0.0, 1.0, 0.0)),
         rotate(q, (0.0, 0.0, 1.0)),
     )
-    s_min = max(1.0 / max_range, primitives.TINY)
+    s_min = max(1.0 / max_range, TINY)
     nowhere = (0.0, 0.0, 0.0)
     if cylindrical:
         for u in range(len(lines)):
@@ -147,75 +166,53 @@ def aim(
             lines[u, 0], lines[u, 1] = math.cos(angle), math.sin(angle)
         for v in range(len(xs)):
             xs[v] = (v - cy) / focal
-        return projection.View(focal, cx, cy, s_min, cylindrical), projection.Pose(
-            forward, right, down, nowhere
-        )
+        return View(focal, cx, cy, s_min, cylindrical), Pose(forward, right, down, nowhere)
     for v in range(len(lines)):
         lines[v, 0], lines[v, 1] = 1.0, (v - cy) / focal
     for u in range(len(xs)):
         xs[u] = (u - cx) / focal
-    return projection.View(focal, cy, cx, s_min, cylindrical), projection.Pose(
-        forward, down, right, nowhere
-    )
+    return View(focal, cy, cx, s_min, cylindrical), Pose(forward, down, right, nowhere)
 
 
 @borrowing_kernel
 def draw_bodies(
-    out: projection.Image,
-    ids: primitives.Ids | None,
-    drawn_in: primitives.Rectangles | None,
-    lines: primitives.Lines,
-    xs: primitives.Line,
-    bent: projection.Bent | None,
-    view: projection.View,
-    axes: projection.Pose,
-    camera: Vec,
-    bounds: NDArray[np.float64],
-    shape: NDArray[np.int8],
-    center: NDArray[np.float64],
-    half_size: NDArray[np.float64],
-    yaw: NDArray[np.float64],
+    out: Image,
+    ids: Ids | None,
+    drawn_in: Rectangles | None,
+    optics: Optics,
+    scene: Scene,
     meshes: Meshes | None,
     faces: Faces | None,
 ) -> int:
     """Write the inverse depth of an arena; return the obstacle around the camera, or -1.
 
-    Args not listed are those of `render_depth`. `out` (n, m) is inverse depth [1/m], 0 = no return.
-    `ids` (n, m) is CEILING, SKY, ..., OBSTACLE + number, or GROUND for hills, `drawn_in` (obstacles
-    + meshes, 3, 4) the rectangles of bodies, `faces` (n, m) the visible triangles of meshes; these
-    three are written unless None. `lines`, `xs`, `view` and `axes` are those of `aim`, `bent` a
-    fisheye's rays or None, `camera` (3,) NED [m], above the floor.
+    `out` (n, m) is inverse depth [1/m], 0 = no return. `ids` (n, m) is CEILING, SKY, ...,
+    OBSTACLE + number, or GROUND for hills, `drawn_in` (obstacles + meshes, 3, 4) the rectangles of
+    bodies, `faces` (n, m) the visible triangles of meshes. These three are written unless None.
     """
+    bounds, camera, axes = scene.bounds, optics.camera, optics.axes
     room = (
         0.5 * (bounds[0] + bounds[1]) - camera[0],
         0.5 * (bounds[2] + bounds[3]) - camera[1],
         -0.5 * bounds[4] - camera[2],
     )
     half_room = (0.5 * (bounds[1] - bounds[0]), 0.5 * (bounds[3] - bounds[2]), 0.5 * bounds[4])
-    forward, across, along = axes.forward, axes.across, axes.along
-    closed = bounds[5] > 0.0
-    pose = projection.Pose(forward, across, along, room)
-    primitives.draw_room(out, ids, lines, xs, bent, view, pose, half_room, closed)
-    for i in range(len(shape)):
+    pose = Pose(axes.forward, axes.across, axes.along, room)
+    draw_room(out, ids, optics, pose, half_room, bounds[5] > 0.0)
+    for i in range(len(scene.shape)):
         if is_owned(meshes, i):
             continue
-        offset = (center[i, 0] - camera[0], center[i, 1] - camera[1], center[i, 2] - camera[2])
-        half = (half_size[i, 0], half_size[i, 1], half_size[i, 2])
-        pose = projection.Pose(forward, across, along, offset)
         kept = None if drawn_in is None else drawn_in[i]
-        number = primitives.OBSTACLE + i
-        if _draw_obstacle(
-            out, ids, kept, number, lines, xs, bent, view, pose, shape[i], half, yaw[i]
-        ):
+        if _draw_obstacle(out, ids, kept, optics, body_of(scene, axes, camera, i)):
             return i
     if meshes is not None:
-        draw_meshes(out, ids, faces, drawn_in, lines, xs, bent, view, axes, camera, meshes)
+        draw_meshes(out, ids, faces, drawn_in, optics, optics.bent, meshes)
     return -1
 
 
 @kernel
 def render_depth(
-    out: projection.Image,
+    out: Image,
     position: Vec | NDArray[np.float64],
     quaternion: Quat | NDArray[np.float64],
     focal: float,
@@ -229,36 +226,24 @@ def render_depth(
     half_size: NDArray[np.float64],
     yaw: NDArray[np.float64],
     meshes: Meshes | None,
-    bent: projection.Bent | None,
+    bent: Bent | None,
 ) -> None:
     """Render the depth image of an arena.
 
     The floor is the rectangle of the bounds at z = 0. The walls are thin, stand on its edges and
-    are seen from both sides; a ray that passes over them has no return, unless there is a ceiling
+    are seen from both sides. A ray that passes over them has no return, unless there is a ceiling
     at their height. A camera less than `MIN_DEPTH_M` above the ground is lifted to that height (a
     resting vehicle sinks in by the contact's penetration). From inside an obstacle every pixel
-    reads `MIN_DEPTH_M`. In place of the obstacles that a mesh owns its triangles are seen, from
-    inside as well.
+    reads `MIN_DEPTH_M`. Meshes are seen in place of the obstacles that they own, from inside as
+    well.
 
-    Args:
-        out: (height, width) depth [m], written; 0 = no return. Along the optical axis of a pinhole,
-            in the camera's horizontal plane of a cylinder, along the ray of a fisheye.
-        position: (3,) camera NED [m].
-        quaternion: (4,) unit [w, x, y, z] camera -> NED: its x axis is the optical axis, y points
-            to the right of the image, z to its bottom.
-        focal: Focal length [px] of a pinhole, columns for an angle [px/rad] of a cylinder.
-        cx: Column of the optical axis; pixel centres are at whole numbers.
-        cy: Row of the optical axis.
-        cylindrical: The image is a cylinder's, as `Intrinsics` defines it.
-        max_range: Greatest depth that gives a return [m].
-        bounds: (6,) `Bounds.as_array()`.
-        shape: (n,) `Shape`.
-        center: (n, 3) NED [m].
-        half_size: (n, 3) as in `Obstacles` [m].
-        yaw: (n,) heading of a box's first axis [rad].
-        meshes: Those that are seen, hills among them; None: there are none, and nothing is spent on
-            them.
-        bent: The rays of a fisheye (`fisheye.bent_of`); None: it is a pinhole or a cylinder.
+    `out` (height, width) is depth [m], written; 0 = no return. It is measured along the optical
+    axis of a pinhole, in the camera's horizontal plane of a cylinder, along the ray of a fisheye.
+    The camera is at `position` NED [m]. Its x axis by `quaternion` (camera -> NED) is the optical
+    axis; y points to the right of the image, z to its bottom. `focal`, `cx`, `cy` and `cylindrical`
+    are those of `Intrinsics`, `bent` the rays of a fisheye (`bent_of`), None for others. `bounds`
+    (6,) is `Bounds.as_array()`; the obstacles' arrays (n, ...) are those of `Obstacles`. `meshes`
+    are those that are seen, hills among them; None costs nothing.
     """
     camera = raised(meshes, position)
     height, width = out.shape
@@ -267,12 +252,11 @@ def render_depth(
     view, axes = aim(lines, xs, quaternion, focal, cx, cy, cylindrical, max_range)
     # A cylinder's is drawn column by column, each in one piece; `out` gets them at the end.
     drawn = np.empty((width, height), np.float32) if cylindrical else out
-    inside = draw_bodies(
-        drawn, None, None, lines, xs, bent, view, axes, camera, bounds, shape, center, half_size,
-        yaw, meshes, None,
-    )  # fmt: skip
+    optics = Optics(lines, xs, bent, view, axes, camera)
+    scene = Scene(bounds, shape, center, half_size, yaw)
+    inside = draw_bodies(drawn, None, None, optics, scene, meshes, None)
     if inside >= 0:
-        out[:, :] = projection.MIN_DEPTH_M
+        out[:, :] = MIN_DEPTH_M
         if bent is not None:
             blank(out, bent)
         return

@@ -1,14 +1,21 @@
-"""What the pixels of a camera look along, of any projection; with numpy alone."""
+"""Rays of a camera's pixels, of any projection; with numpy alone.
+
+A fisheye has r = f theta_d, where theta_d is the angle from the optical axis as
+`profiles.distortion` distorts it. Its depth is measured along the ray: along the optical axis it
+would be 0 at 90 degrees, and negative beyond.
+"""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.camera.equidistant import fisheye_rays
 from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.profiles.distortion import distorted, sees_to, undistorted
 
 
 def rays_of(camera: Intrinsics) -> NDArray[np.float64]:
@@ -36,3 +43,28 @@ def finer(camera: Intrinsics, side: int) -> Intrinsics:
         cx=side * (k.cx + 0.5) - 0.5,
         cy=side * (k.cy + 0.5) - 0.5,
     )
+
+
+def fisheye_rays(camera: Intrinsics) -> NDArray[np.float64]:
+    """Return unit rays (3, h, w) forward, right, down of a fisheye; 0 outside the circle."""
+    across = (np.arange(camera.width) - camera.cx) / camera.focal
+    down = ((np.arange(camera.height) - camera.cy) / camera.focal)[:, None]
+    out = np.hypot(across, down)
+    off = undistorted(out, camera.distortion)
+    outside = np.isinf(off)
+    off[outside] = 0.0
+    # sin(off) / out, which is 1 in the middle.
+    share = np.sinc(off / math.pi) * np.divide(off, out, out=np.ones_like(out), where=out > 0.0)
+    rays = np.stack([np.cos(off), across * share, down * share])
+    rays[:, outside] = 0.0
+    return rays
+
+
+def fisheye_places(camera: Intrinsics, points: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return columns and rows of points (3, ...); infinity outside the circle."""
+    aside = np.hypot(points[1], points[2])
+    off = np.arctan2(aside, points[0])
+    scale = camera.focal * distorted(off, camera.distortion) / np.maximum(aside, 1e-9)
+    scale = np.where(off > sees_to(camera.distortion), np.inf, scale)
+    with np.errstate(invalid="ignore"):
+        return points[1] * scale + camera.cx, points[2] * scale + camera.cy

@@ -3,7 +3,7 @@
 Where an image sees varnish, metal or glass, its pixel is drawn once more: from the camera's ray a
 tree of rays grows, mirrored by varnish, metal and glass, straight on through glass, until all that
 they meet is matt, or counts for nothing. A rough surface that the camera itself sees mirrors
-`gloss.SAMPLES` directions; those seen in others are as if smooth, but for the sun, whose highlight
+`gloss.SAMPLES` directions. Those seen in others are as if smooth, but for the sun, whose highlight
 has a closed form. What is matt looks as in `shading.paint`, with a shadow ray to the sun.
 """
 
@@ -15,20 +15,35 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.arena.appearance import FLOOR as FLOOR_ROW
+from airl_mav.arena.appearance import OBSTACLE as OBSTACLE_ROW
+from airl_mav.arena.appearance import WALLS as WALLS_ROW
 from airl_mav.camera import gloss, shading
 from airl_mav.camera.bvh import STACK, Meshes
-from airl_mav.camera.mesh_shadows import ABOVE_M
-from airl_mav.camera.primitives import CEILING, SKY, Ids
-from airl_mav.camera.projection import dot
-from airl_mav.camera.ray_ends import Look, albedo_at, row_of, sky_at
+from airl_mav.camera.primitives import (
+    BOX,
+    CEILING,
+    CYLINDER,
+    FLOOR,
+    GROUND,
+    OBSTACLE,
+    SKY,
+    WALL_NORTH_SOUTH,
+    Ids,
+)
+from airl_mav.camera.projection import Scene, dot
 from airl_mav.camera.scene_rays import (
     Bodies,
+    Met,
+    Place,
     advanced,
     bodies_of,
     meet,
     place_of,
     sunlight,
 )
+from airl_mav.camera.shadows import ABOVE_M
+from airl_mav.camera.surfaces import FOG_LAYER_M
 from airl_mav.core.kernels import borrowing_kernel, kernel, large_borrowing_kernel, large_kernel
 from airl_mav.vehicle.rotation import Vec
 
@@ -74,21 +89,17 @@ def draw_reflections(
     ids: Ids,
     rays: shading.Rays,
     camera: Vec,
-    bounds: NDArray[np.float64],
-    shape: NDArray[np.int8],
-    center: NDArray[np.float64],
-    half_size: NDArray[np.float64],
-    yaw: NDArray[np.float64],
+    scene: Scene,
     meshes: Meshes | None,
-    look: Look,
+    look: shading.Look,
 ) -> None:
-    """Redraw the pixels of surfaces that are not matt; `look` is the appearance of the arena.
+    """Redraw the pixels of surfaces that are not matt.
 
     `out` (n,) are packed colours, `ids` (n,) what is seen, `rays` those of the pixels, `camera`
-    (3,) NED [m]; the rest as of `render_depth`.
+    (3,) NED [m].
     """
     tree, nodes = np.empty((_WAITING, _RAY)), np.empty(STACK, np.int32)
-    colour, bodies = np.empty(3), bodies_of(bounds, shape, center, half_size, yaw)
+    colour, bodies = np.empty(3), bodies_of(scene)
     for u in range(len(out)):
         seen = ids[u]
         if seen in (SKY, CEILING) or look.gloss.surface[row_of(seen)] == gloss.MATT:
@@ -156,7 +167,7 @@ def _follow(
     nodes: NDArray[np.int32],
     bodies: Bodies,
     meshes: Meshes | None,
-    look: Look,
+    look: shading.Look,
     pixel2: np.float32,
 ) -> None:
     """Write the linear RGB (3,) that the first ray of a tree brings; `nodes` (STACK,) is room."""
@@ -279,3 +290,87 @@ def _mirror(tree: NDArray[np.float64], tops: int, seen: Seen, kind: int) -> int:
             share = _scaled(share, gloss.fresnel(min(max(-dot(shine, seen.ray), 0.0), 1.0)))
         tops = _grown(tree, tops, seen, away, share, 0.0 if many == 1 else seen.alpha)
     return tops
+
+
+# --- where a ray ends
+
+
+@kernel
+def row_of(seen: int) -> int:
+    """Return the row of `Finish` of what is seen: neither ceiling nor sky."""
+    if seen >= OBSTACLE:
+        return OBSTACLE_ROW + seen - OBSTACLE
+    return FLOOR_ROW if seen in (FLOOR, GROUND) else WALLS_ROW
+
+
+@large_borrowing_kernel
+def albedo_at(
+    look: shading.Look,
+    row: int,
+    bodies: Bodies,
+    met: Met,
+    place: Place,
+    meshes: Meshes | None,
+    ray: Vec,
+    way: float,
+    pixel2: np.float32,
+) -> Vec:
+    """Return the linear RGB albedo of a surface where a ray meets it."""
+    surface = shading.surface_of(look, row)
+    a, b, c = shading.F32(place.at[0]), shading.F32(place.at[1]), shading.F32(place.at[2])
+    per_m, per_turn = surface.per_m, shading.F32(0.0)
+    across, along, in_periods = shading.ZERO, shading.ZERO, False
+    if met.mesh >= 0:
+        if meshes is not None:
+            n = meshes.bvh.normals[met.face]
+            across, along = shading.on_triangle(a, b, c, n[0], n[1], n[2])
+    elif met.seen == FLOOR:
+        across, along = b, -a
+    elif met.seen < OBSTACLE:
+        across, along = (b if met.seen == WALL_NORTH_SOUTH else a), c
+    else:
+        shape, radius = (
+            bodies.shape[met.seen - OBSTACLE],
+            bodies.half_size[met.seen - OBSTACLE, 0],
+        )
+        if shape == BOX:
+            across, along = shading.on_box(a, b, c, place.side == 2, place.side == 0)
+        else:
+            per_turn, in_periods = shading.periods_around(radius, per_m), True
+            if shape == CYLINDER:
+                across, along = shading.on_cylinder(a, b, c, place.side == 2, per_m, per_turn)
+            else:
+                across, along = shading.on_sphere(a, b, c, per_turn)
+    if not in_periods:
+        across, along = across * per_m, along * per_m
+    steep = max(shading.F32(-dot(place.normal, ray)), shading.STEEP)
+    texels = shading.texels2(surface, pixel2) * shading.F32(way) * shading.F32(way) / steep
+    at = shading.texel_at(across + surface.offset[0], along + surface.offset[1], texels)
+    red = look.atlas[np.uint64(surface.base + at)]
+    green, blue = red, red
+    if surface.step != 0:
+        green = look.atlas[np.uint64(surface.base + surface.step + at)]
+        blue = look.atlas[np.uint64(surface.base + 2 * surface.step + at)]
+    dark, more = surface.albedo, surface.more
+    return (
+        float(dark[0] + more[0] * red),
+        float(dark[1] + more[1] * green),
+        float(dark[2] + more[2] * blue),
+    )
+
+
+@kernel
+def sky_at(light: shading.Lit, ray: Vec, down: float) -> Vec:
+    """Return linear RGB of the sky, or of the ground below the horizon, as `draw_sky`."""
+    rise, through = -ray[2], 1.0
+    if light.extinction > 0.0:
+        thick = FOG_LAYER_M if rise > 0.0 else max(-down, 1e-3)
+        through = math.exp(-float(light.extinction) * thick / max(abs(rise), 1e-6))
+    horizon = (float(light.horizon[0]), float(light.horizon[1]), float(light.horizon[2]))
+    end = light.zenith if rise >= 0.0 else light.ground
+    share = through * (rise if rise >= 0.0 else 1.0)
+    return (
+        horizon[0] + share * (float(end[0]) - horizon[0]),
+        horizon[1] + share * (float(end[1]) - horizon[1]),
+        horizon[2] + share * (float(end[2]) - horizon[2]),
+    )

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.bvh import meshes_of
-from airl_mav.camera.fisheye import bent_of
 from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.projection import bent_of
 from airl_mav.camera.raycast import render_depth
 from airl_mav.core.kernels import kernel
 from airl_mav.profiles.camera import Camera
@@ -88,18 +88,9 @@ def render(
 ) -> NDArray[np.float32]:
     """Return the depth image (height, width) [m] of an arena; 0 = no return.
 
-    Depth passes through obstacles of glass, and sees what is behind them.
-
-    Args:
-        arena: The arena.
-        centers: (n, 3) present obstacle centres NED [m], as of `Arena.centers_at`.
-        intrinsics: The camera.
-        max_range: Maximum depth [m].
-        position: (3,) camera NED [m].
-        quaternion: (4,) unit [w, x, y, z] camera -> NED; its x axis is the optical axis.
-
-    Raises:
-        UsageError: A mesh's file is missing or has changed.
+    Depth passes through obstacles of glass, and sees what is behind them. `centers` (n, 3) are
+    those of `Arena.centers_at`. The pose is that of the camera, NED [m], camera -> NED. Raises
+    UsageError if a mesh's file is missing or has changed.
     """
     k, obstacles = intrinsics, arena.obstacles
     image = np.empty((k.height, k.width), np.float32)

@@ -17,9 +17,8 @@ from airl_mav.arena.appearance import OBSTACLE as OBSTACLE_ROW
 from airl_mav.arena.appearance import WALLS as WALLS_ROW
 from airl_mav.camera import primitives
 from airl_mav.camera.bvh import Meshes, is_owned, material_row
-from airl_mav.camera.mesh_rays import distance_to, stopped_by
-from airl_mav.camera.meshes import inverse_of
-from airl_mav.camera.projection import dot
+from airl_mav.camera.meshes import distance_to, inverse_of, stopped_by
+from airl_mav.camera.projection import Scene, dot
 from airl_mav.core.kernels import borrowing_kernel, kernel, large_borrowing_kernel
 from airl_mav.vehicle.rotation import Vec
 
@@ -63,14 +62,9 @@ class Place(NamedTuple):
 
 
 @kernel
-def bodies_of(
-    bounds: NDArray[np.float64],
-    shape: NDArray[np.int8],
-    center: NDArray[np.float64],
-    half_size: NDArray[np.float64],
-    yaw: NDArray[np.float64],
-) -> Bodies:
+def bodies_of(scene: Scene) -> Bodies:
     """Return the bodies of an arena, with what all rays need of them."""
+    bounds, shape, center, half_size, yaw = scene
     n = len(shape)
     turn, reach = np.empty((n, 2)), np.empty(n)
     for i in range(n):

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.arena.appearance import TEXTURES
-from airl_mav.camera.textures import LEVELS, STRIDE
+from airl_mav.camera.gloss import Gloss
+from airl_mav.camera.textures import LEVELS, SIDE, STRIDE
 from airl_mav.core.kernels import borrowing_kernel, kernel
 
 F32 = np.float32
@@ -85,15 +86,36 @@ class Lit(NamedTuple):
     extinction: np.float32
 
 
+class Look(NamedTuple):
+    """How an arena looks, as `colour.render_colour` takes it; and how wide pixels are."""
+
+    texture: NDArray[np.int8]  # (2 + n,)
+    per_m: NDArray[np.float32]  # (2 + n,)
+    offset: NDArray[np.float32]  # (2 + n, 2)
+    albedo: NDArray[np.float32]  # (2 + n, 2, 3)
+    gloss: Gloss  # None where all surfaces are matt
+    light: Lit
+    atlas: Plane
+    pixel2: np.float32
+    """Square of the side of a pixel at a depth of 1."""
+
+
+class Canvas(NamedTuple):
+    """An image that is shaded: its n pixels line after line, and room to work in."""
+
+    out: Packed  # (n,) written
+    ids: Packed  # (n,) what each pixel sees
+    far: Plane  # (n,) depth [m], 0: no surface
+    lit: Plane  # (n,) 1 in the sun, 0 in shadow
+    clear: Plane  # (n,) transmission of fog
+    rays: Rays
+    points: Points
+
+
 @borrowing_kernel
-def surface_of(
-    texture: NDArray[np.int8],
-    per_m: NDArray[np.float32],
-    offset: NDArray[np.float32],
-    albedo: NDArray[np.float32],
-    i: int,
-) -> Surface:
-    """Return row i of the arrays of materials."""
+def surface_of(look: Look, i: int) -> Surface:
+    """Return a row of the materials."""
+    texture, per_m, offset, albedo = look.texture, look.per_m, look.offset, look.albedo
     dark = (albedo[i, 0, 0], albedo[i, 0, 1], albedo[i, 0, 2])
     more = (
         albedo[i, 1, 0] - dark[0],
@@ -144,27 +166,19 @@ def irradiance(light: Lit, channel: int, direct: np.float32, rise: np.float32) -
 
 @borrowing_kernel
 def paint(
-    out: Packed,
-    seen: Packed,
-    lit: Plane,
-    clear: Plane,
+    canvas: Canvas,
+    look: Look,
+    surface: Surface,
     left: int,
     end: int,
     first: np.int32,
     last: np.int32,
-    points: Points,
-    surface: Surface,
-    light: Lit,
-    atlas: Plane,
 ) -> None:
-    """Write the packed sRGB of left..end where `seen` is first..last; Lambert's and Beer's laws.
-
-    `lit` (n,) is 1 in the sun, 0 in shadow, `clear` (n,) the transmission of fog, `points` are
-    those of the part, and `atlas` is `textures.atlas()`.
-    """
-    place, facing, up, pattern, green_of, blue_of = points
-    row, marks = out[left:end], seen[left:end]
-    lit_row, clear_row = lit[left:end], clear[left:end]
+    """Write the packed sRGB of left..end where first..last are seen; Lambert's and Beer's laws."""
+    place, facing, up, pattern, green_of, blue_of = canvas.points
+    light, atlas = look.light, look.atlas
+    row, marks = canvas.out[left:end], canvas.ids[left:end]
+    lit_row, clear_row = canvas.lit[left:end], canvas.clear[left:end]
     # By itself: a loop that reads from all over the atlas does not vectorise. Unsigned: of a number
     # with a sign it would ask each time whether it counts from the end.
     for u in range(end - left):
@@ -193,7 +207,7 @@ def paint(
 
 @kernel
 def encoded(x: np.float32) -> np.int32:
-    """Return linear light as an sRGB number, 0..255 (IEC 61966-2-1); negative light is black.
+    """Return linear light as an sRGB number, 0..255 (IEC 61966-2-1). Negative light is black.
 
     The power is a minimax polynomial of the root, accurate to 0.09 of a step.
     """
@@ -227,3 +241,81 @@ def turn_of(y: np.float32, x: np.float32) -> np.float32:
     angle = F32(0.25) - angle if ay > ax else angle
     angle = HALF - angle if x < ZERO else angle
     return -angle if y < ZERO else angle
+
+
+# --- where a point lies in the pattern of its material
+#
+# Places are along the body's own axes [m]. The pattern is in metres, or in periods where it goes
+# round a body in a whole number of them. Inlined into the loops of `surfaces`, which vectorise.
+
+_TURN: Final = 2.0 * math.pi
+
+STEEP: Final = F32(0.02)
+"""Least cosine between ray and normal for the size of a pixel."""
+
+
+@kernel
+def texels2(surface: Surface, pixel2: np.float32) -> np.float32:
+    """Return the square of the texels of the finest level that a pixel covers 1 m away, head on."""
+    texels = F32(SIDE) * surface.per_m
+    return texels * texels * pixel2
+
+
+@kernel
+def periods_around(radius: float, per_m: np.float32) -> np.float32:
+    """Return the whole number of periods around a body of a radius [m]."""
+    return F32(max(np.rint(_TURN * radius * per_m), 1.0))
+
+
+@kernel
+def on_box(
+    a: np.float32, b: np.float32, c: np.float32, on_c: bool, on_a: bool
+) -> tuple[np.float32, np.float32]:
+    """Return the place [m] in the pattern of a box face, from its middle.
+
+    `a`, `b` and `c` (down) are box coordinates from the centre; `on_c` marks upper and lower faces,
+    otherwise `on_a` those across the first axis.
+    """
+    across = a if on_c else (b if on_a else a)
+    along = b if on_c else c
+    return across, along
+
+
+@kernel
+def on_cylinder(
+    a: np.float32,
+    b: np.float32,
+    c: np.float32,
+    cap: bool,
+    per_m: np.float32,
+    per_turn: np.float32,
+) -> tuple[np.float32, np.float32]:
+    """Return a place in the pattern of a cylinder, in periods; `cap`: on one of its ends."""
+    across = a * per_m if cap else turn_of(b, a) * per_turn
+    along = (b if cap else c) * per_m
+    return across, along
+
+
+@kernel
+def on_sphere(
+    a: np.float32, b: np.float32, c: np.float32, per_turn: np.float32
+) -> tuple[np.float32, np.float32]:
+    """Return a place in the pattern of a sphere, in periods: by longitude and latitude."""
+    return turn_of(b, a) * per_turn, turn_of(c, np.sqrt(a * a + b * b)) * per_turn
+
+
+@kernel
+def on_triangle(
+    a: np.float32,
+    b: np.float32,
+    c: np.float32,
+    n0: np.float32,
+    n1: np.float32,
+    n2: np.float32,
+) -> tuple[np.float32, np.float32]:
+    """Return a place in the pattern of a triangle [m], as seen along the axis of its normal."""
+    q0, q1, q2 = abs(n0), abs(n1), abs(n2)
+    level = q2 >= max(q0, q1)
+    across = a if level or q1 > q0 else b
+    along = b if level else c
+    return across, along

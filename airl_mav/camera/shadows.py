@@ -3,21 +3,35 @@
 Drawn as the bodies are: an obstacle's shadow touches only the pixels of the rectangle that its
 shadow volume (the body, drawn along the light down to the floor) projects to. A convex body's own
 dark side is where it faces away from the sun, so no body is tested against itself, and nothing
-needs an offset against false shadows.
+needs an offset against false shadows. Meshes shade by parallel rays through their trees.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.camera.primitives import BOX, CYLINDER, OBSTACLE, Ids, Line, Lines, turned
-from airl_mav.camera.projection import Bent, Pose, Rectangle, View, dot, ray_of
-from airl_mav.camera.shading import F32, ONE, ZERO, Plane, Rays, Vec32
-from airl_mav.core.kernels import borrowing_kernel, kernel
+from airl_mav.camera.bvh import STACK, Meshes, material_row
+from airl_mav.camera.gloss import Gloss, let_through
+from airl_mav.camera.mesh_triangles import Faces
+from airl_mav.camera.meshes import inverse_of, seen_from, stopped_by
+from airl_mav.camera.primitives import BOX, CYLINDER, OBSTACLE, SKY, Ids, turned
+from airl_mav.camera.projection import (
+    Bent,
+    Body,
+    Optics,
+    Pose,
+    Rectangle,
+    View,
+    dot,
+    is_pinhole,
+    ray_of,
+)
+from airl_mav.camera.shading import F32, ONE, ZERO, Canvas, Plane, Vec32
+from airl_mav.core.kernels import borrowing_kernel, kernel, large_borrowing_kernel, large_kernel
 from airl_mav.vehicle.rotation import Vec
 
 _NEAR_M: Final = 0.01
@@ -31,6 +45,13 @@ VECTOR: Final = 16
 
 CORNERS: Final = 16
 """Of a shadow volume: those of the box around a body, then where their shadows fall."""
+
+
+ABOVE_M: Final = 5e-4
+"""So far above the surface that is seen, and no nearer to its own, a ray begins [m]."""
+
+_WIDER_M: Final = 1e-4
+"""The box around a mesh is so much larger, where what is worked out is rounded to float32 [m]."""
 
 
 @kernel
@@ -54,21 +75,18 @@ def widened(left: int, end: int, low: int, high: int) -> tuple[int, int]:
 
 @borrowing_kernel
 def shade_by_walls(
-    lit: Plane,
-    clear: Plane,
-    far: Plane,
-    rays: Rays,
+    canvas: Canvas,
     camera: Vec,
     bounds: NDArray[np.float64],
     to_sun: Vec,
     extinction: float,
     through: np.float32,
 ) -> None:
-    """Write the sunlight `lit` (n,) that passes the walls, and the fog's transmission `clear`.
+    """Write the sunlight `lit` that passes the walls, and the fog's transmission `clear`.
 
-    `far` (n,) is depth [m], 0: no surface; `extinction` is that of fog [1/m], `through` the
-    transmission of the walls, 0 but for glass.
+    `extinction` is that of fog [1/m], `through` the transmission of the walls, 0 but for glass.
     """
+    lit, clear, far, rays = canvas.lit, canvas.clear, canvas.far, canvas.rays
     north, east, up = sized(to_sun[0]), sized(to_sun[1]), F32(-to_sun[2])
     # From the camera to the walls that the sunlight comes over.
     edge_n = F32((bounds[1] if north > 0.0 else bounds[0]) - camera[0])
@@ -118,43 +136,34 @@ def ray32(
     return F32(n), F32(e), F32(d)
 
 
+class Shaded(NamedTuple):
+    """An image whose shadows are drawn, line by line."""
+
+    lit: Plane  # (n, m) written
+    far: Plane  # (n, m) depth [m]
+    ids: Ids  # (n, m) what each pixel sees
+    corners: NDArray[np.float64]  # (CORNERS, 3) a buffer
+
+
 @borrowing_kernel
 def shade_by_obstacle(
-    lit: Plane,
-    far: Plane,
-    ids: Ids,
-    corners: NDArray[np.float64],
-    number: int,
-    lines: Lines,
-    xs: Line,
-    bent: Bent | None,
-    view: View,
-    world: Pose,
-    camera: Vec,
-    shape: int,
-    half: Vec,
-    yaw: float,
-    to_sun: Vec,
-    through: np.float32,
+    image: Shaded, optics: Optics, body: Body, to_sun: Vec, through: np.float32
 ) -> None:
-    """Put the points that an obstacle hides from the sun into shadow: `lit` (n, m) times `through`.
-
-    `far` (n, m) is depth [m], `ids` what is seen, `corners` (CORNERS, 3) a buffer, `number`,
-    `shape`, `half` [m] and `yaw` [rad] are the obstacle's, `world` holds the camera's axes and its
-    centre from the camera, `to_sun` (3,) is a unit vector NED; the rest as of
-    `raycast.draw_bodies`.
-    """
+    """Multiply `lit` by `through` where an obstacle hides the sun (unit vector NED)."""
+    lit, far, ids, corners = image
+    lines, xs, bent, view = optics.lines, optics.xs, optics.bent, optics.lens
+    shape, half, world = body.shape, body.half, body.pose
     level = math.sqrt(to_sun[0] * to_sun[0] + to_sun[1] * to_sun[1])
     cos, sin = 1.0, 0.0
     if shape == BOX:
-        cos, sin = math.cos(yaw), math.sin(yaw)
+        cos, sin = math.cos(body.yaw), math.sin(body.yaw)
     elif level > 0.0:
         cos, sin = to_sun[0] / level, to_sun[1] / level
     pose = turned(world, cos, sin)
     sun = (cos * to_sun[0] + sin * to_sun[1], cos * to_sun[1] - sin * to_sun[0], to_sun[2])
     top, bottom, left, end = 0, len(lines), 0, len(xs)
-    if bent is None and not view.cylindrical:
-        floor = -(world.center[2] + camera[2])
+    if is_pinhole(bent, view):
+        floor = -(world.center[2] + optics.camera[2])
         top, bottom, left, end = shadow_rectangle(
             corners, len(lines), len(xs), view, pose, half, sun, floor
         )
@@ -167,7 +176,7 @@ def shade_by_obstacle(
     i0, i1, i2 = F32(1.0 / sized(sun[0])), F32(1.0 / sized(sun[1])), F32(1.0 / sized(sun[2]))
     w0, w1, w2 = F32(half[0]) * abs(i0), F32(half[1]) * abs(i1), F32(half[2]) * abs(i2)
     square, per_level = F32(half[0] * half[0]), F32(1.0 / max(level, 1e-6))
-    own = np.int32(OBSTACLE + number)
+    own = np.int32(OBSTACLE + body.number)
     for v in range(top, bottom):
         start = start32(f, lines[v, 0], lines[v, 1])
         far_row, ids_row, lit_row = far[v, left:end], ids[v, left:end], lit[v, left:end]
@@ -287,3 +296,103 @@ def _first(low: float, n: int) -> int:
 def _last(high: float, n: int) -> int:
     """Return the end of those that what ends at a place can fall on."""
     return int(min(max(math.ceil(high) + 1.0, 0.0), float(n)))
+
+
+@large_kernel
+def shade_by_meshes(
+    image: Shaded, optics: Optics, meshes: Meshes, faces: Faces, to_sun: Vec, gloss: Gloss | None
+) -> None:
+    """Put the points that meshes hide from the sun into shadow.
+
+    Rays from meshes begin slightly above the visible side. Sides away from the sun need none.
+    `faces` (n, m) are the meshes' visible triangles; `gloss` has the surfaces' transmission,
+    None: opaque.
+    """
+    waiting, maybe = np.empty(STACK, np.int32), np.empty(len(optics.xs), np.bool_)
+    for k in range(len(meshes.root)):
+        through = let_through(gloss, material_row(meshes, k))
+        _shade_by_mesh(image, optics, meshes, k, faces, to_sun, through, waiting, maybe)
+
+
+@large_borrowing_kernel
+def _shade_by_mesh(
+    image: Shaded,
+    optics: Optics,
+    meshes: Meshes,
+    k: int,
+    faces: Faces,
+    to_sun: Vec,
+    through: np.float32,
+    waiting: NDArray[np.int32],
+    maybe: NDArray[np.bool_],
+) -> None:
+    """Put the points that mesh k hides into shadow but a share `through`; `maybe` is a buffer."""
+    lit, far, ids, corners = image
+    lines, xs, bent, view = optics.lines, optics.xs, optics.bent, optics.lens
+    bvh, root, scale = meshes.bvh, meshes.root[k], meshes.pose[k, 4]
+    cos, sin = meshes.pose[k, 2], meshes.pose[k, 3]
+    pose = seen_from(optics, meshes.pose, k)
+    sun = (cos * to_sun[0] + sin * to_sun[1], cos * to_sun[1] - sin * to_sun[0], to_sun[2])
+    box = bvh.boxes[root]
+    half = (float(box[3]), float(box[4]), float(box[5]))
+    c = pose.center
+    middle = (c[0] + box[0], c[1] + box[1], c[2] + box[2])
+    top, bottom, left, end = 0, len(lines), 0, len(xs)
+    per = 1.0 / scale
+    if is_pinhole(bent, view):
+        # In units of the mesh, as all that follows.
+        floor = -(middle[2] + per * optics.camera[2])
+        around = Pose(pose.forward, pose.across, pose.along, middle)
+        top, bottom, left, end = shadow_rectangle(
+            corners, len(lines), len(xs), view, around, half, sun, floor
+        )
+    if top >= bottom or left >= end:
+        return
+    left, end = widened(left, end, 0, len(xs))
+    inverse = (inverse_of(sun[0]), inverse_of(sun[1]), inverse_of(sun[2]))
+    own = np.int32(OBSTACLE + meshes.first[k])
+    f, d, along = pose.forward, pose.across, along32(pose)
+    above, last = per * ABOVE_M, -1
+    # First which points may be hidden, in float32 and so many at a time.
+    c0, c1, c2 = F32(middle[0]), F32(middle[1]), F32(middle[2])
+    per32 = F32(per)
+    i0, i1, i2 = F32(inverse[0]), F32(inverse[1]), F32(inverse[2])
+    wide = per * _WIDER_M
+    w0, w1, w2 = (
+        F32((half[0] + wide) * abs(inverse[0])),
+        F32((half[1] + wide) * abs(inverse[1])),
+        F32((half[2] + wide) * abs(inverse[2])),
+    )
+    for v in range(top, bottom):
+        start = start32(pose, lines[v, 0], lines[v, 1])
+        far_row, ids_row, lit_row = far[v, left:end], ids[v, left:end], lit[v, left:end]
+        x_row = xs[left:end]
+        for u in range(end - left):
+            t = per32 * far_row[u]
+            n, m, s = ray32(pose, along, bent, v, left + u, start, F32(x_row[u]))
+            a = (c0 - t * n) * i0
+            b = (c1 - t * m) * i1
+            e = (c2 - t * s) * i2
+            enter = max(max(a - w0, b - w1), e - w2)
+            leave = min(min(a + w0, b + w1), e + w2)
+            reached = (leave >= max(enter, ZERO)) & (ids_row[u] != SKY)
+            maybe[u] = reached & (lit_row[u] > ZERO)
+        for u in range(end - left):
+            if not maybe[u]:
+                continue
+            t = per * far_row[u]
+            ahead, y = lines[v, 0], lines[v, 1]
+            begin = (ahead * f[0] + y * d[0], ahead * f[1] + y * d[1], ahead * f[2] + y * d[2])
+            ray = ray_of(pose, bent, v, left + u, begin, x_row[u])
+            # From the mesh's origin.
+            at = (t * ray[0] - c[0], t * ray[1] - c[1], t * ray[2] - c[2])
+            if ids_row[u] == own:
+                i = faces[v, left + u]
+                normal = (bvh.normals[i, 0], bvh.normals[i, 1], bvh.normals[i, 2])
+                side = -above if dot(normal, ray) > 0.0 else above
+                if side * dot(normal, sun) <= 0.0:
+                    continue
+                at = (at[0] + side * normal[0], at[1] + side * normal[1], at[2] + side * normal[2])
+            last = stopped_by(bvh, root, at, sun, inverse, above, last, waiting)
+            if last >= 0:
+                lit_row[u] *= through

@@ -1,4 +1,4 @@
-"""Sky, floor, walls and obstacles in colour, as seen in an image.
+"""Sky, floor, walls, obstacles and meshes in colour, as seen in an image.
 
 Images are shaded in blocks of consecutive lines: pattern places and light, then texels, then
 colours.
@@ -12,26 +12,30 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.camera import patterns, primitives
-from airl_mav.camera.projection import MIN_DEPTH_M, Bent, Pose
+from airl_mav.arena.appearance import FLOOR as FLOOR_ROW
+from airl_mav.arena.appearance import OBSTACLE as OBSTACLE_ROW
+from airl_mav.arena.appearance import WALLS as WALLS_ROW
+from airl_mav.camera import primitives, shading
+from airl_mav.camera.bvh import Meshes, material_row
+from airl_mav.camera.mesh_triangles import Faces
+from airl_mav.camera.projection import MIN_DEPTH_M, Body, Optics, Pose
 from airl_mav.camera.shading import (
     F32,
     I32,
     LEAST,
     ONE,
     ZERO,
+    Canvas,
     Lit,
-    Packed,
-    Plane,
-    Points,
+    Look,
     Rays,
-    Surface,
     packed,
     paint,
+    surface_of,
     texel_at,
 )
 from airl_mav.camera.shadows import along32, ray32, start32, widened
-from airl_mav.core.kernels import borrowing_kernel
+from airl_mav.core.kernels import borrowing_kernel, large_borrowing_kernel
 from airl_mav.vehicle.rotation import Vec
 
 BLOCK: Final = 512
@@ -59,10 +63,9 @@ def span_of(
 
 
 @borrowing_kernel
-def write_rays(
-    rays: Rays, lines: primitives.Lines, xs: primitives.Line, bent: Bent | None, axes: Pose
-) -> None:
+def write_rays(rays: Rays, optics: Optics) -> None:
     """Write the ray of every pixel of an image's lines."""
+    axes, lines, xs = optics.axes, optics.lines, optics.xs
     r = along32(axes)
     n = len(xs)
     for v in range(len(lines)):
@@ -73,14 +76,13 @@ def write_rays(
             rays.down[v * n : v * n + n],
         )
         for u in range(n):
-            north[u], east[u], down[u] = ray32(axes, r, bent, v, u, start, F32(xs[u]))
+            north[u], east[u], down[u] = ray32(axes, r, optics.bent, v, u, start, F32(xs[u]))
 
 
 @borrowing_kernel
-def draw_sky(
-    out: Packed, ids: primitives.Ids, points: Points, rays: Rays, camera: Vec, light: Lit
-) -> None:
+def draw_sky(canvas: Canvas, camera: Vec, light: Lit) -> None:
     """Write sky and, below the horizon, ground as bright as the mean floor; or the ceiling."""
+    out, ids, rays, points = canvas.out, canvas.ids, canvas.rays, canvas.points
     above = F32(max(-camera[2], MIN_DEPTH_M))
     zenith, horizon, ground = light.zenith, light.horizon, light.ground
     rises, clear = points.up, points.pattern
@@ -116,25 +118,14 @@ def draw_sky(
 
 
 @borrowing_kernel
-def shade_floor(
-    out: Packed,
-    ids: primitives.Ids,
-    far: Plane,
-    lit: Plane,
-    clear: Plane,
-    points: Points,
-    rays: Rays,
-    camera: Vec,
-    floor: Surface,
-    light: Lit,
-    atlas: Plane,
-    pixel2: np.float32,
-) -> None:
+def shade_floor(canvas: Canvas, look: Look, camera: Vec) -> None:
     """Shade the floor. Its pattern begins in the start."""
+    floor, rays, points = surface_of(look, FLOOR_ROW), canvas.rays, canvas.points
+    ids, far, light, pixel2 = canvas.ids, canvas.far, look.light, look.pixel2
     at0, at1 = F32(camera[0]), F32(camera[1])
     sun_up = -light.to_sun[2]
     # The camera's height is t times the ray's slope.
-    texel = patterns.texels2(floor, pixel2) / F32(max(-camera[2], MIN_DEPTH_M))
+    texel = shading.texels2(floor, pixel2) / F32(max(-camera[2], MIN_DEPTH_M))
     own = I32(primitives.FLOOR)
     begin, stop = span_of(ids, 0, len(ids), 0, len(ids), own, own)
     for left in range(begin, stop, BLOCK):
@@ -147,28 +138,17 @@ def shade_floor(
             points.place[u] = texel_at(across, along, texel * t * t * t)
             points.facing[u] = sun_up
             points.up[u] = ONE
-        paint(out, ids, lit, clear, left, end, own, own, points, floor, light, atlas)
+        paint(canvas, look, floor, left, end, own, own)
 
 
 @borrowing_kernel
-def shade_walls(
-    out: Packed,
-    ids: primitives.Ids,
-    far: Plane,
-    lit: Plane,
-    clear: Plane,
-    points: Points,
-    rays: Rays,
-    camera: Vec,
-    walls: Surface,
-    light: Lit,
-    atlas: Plane,
-    pixel2: np.float32,
-) -> None:
+def shade_walls(canvas: Canvas, look: Look, camera: Vec) -> None:
     """Shade the walls. Their pattern begins at the foot, north and east of the start."""
+    walls, rays, points = surface_of(look, WALLS_ROW), canvas.rays, canvas.points
+    ids, far, light, pixel2 = canvas.ids, canvas.far, look.light, look.pixel2
     at0, at1, at2 = F32(camera[0]), F32(camera[1]), F32(camera[2])
     sun0, sun1 = light.to_sun[0], light.to_sun[1]
-    texel = patterns.texels2(walls, pixel2)
+    texel = shading.texels2(walls, pixel2)
     first, last = I32(primitives.WALL_NORTH_SOUTH), I32(primitives.WALL_EAST_WEST)
     begin, stop = span_of(ids, 0, len(ids), 0, len(ids), first, last)
     for left in range(begin, stop, BLOCK):
@@ -182,53 +162,38 @@ def shade_walls(
             to_sun = -to_sun if normal > ZERO else to_sun
             across = (at1 + t * e if north else at0 + t * n) * walls.per_m + walls.offset[0]
             along = (at2 + t * d) * walls.per_m + walls.offset[1]
-            texels = texel * t * t / max(abs(normal), patterns.STEEP)
+            texels = texel * t * t / max(abs(normal), shading.STEEP)
             points.place[u] = texel_at(across, along, texels)
             points.facing[u] = max(to_sun, ZERO)
             points.up[u] = ZERO
-        paint(out, ids, lit, clear, left, end, first, last, points, walls, light, atlas)
+        paint(canvas, look, walls, left, end, first, last)
 
 
 @borrowing_kernel
 def shade_obstacle(
-    out: Packed,
-    ids: primitives.Ids,
-    far: Plane,
-    lit: Plane,
-    clear: Plane,
-    points: Points,
-    rectangle: NDArray[np.int32],
-    number: int,
-    lines: primitives.Lines,
-    xs: primitives.Line,
-    bent: Bent | None,
-    world: Pose,
-    shape: int,
-    half: Vec,
-    yaw: float,
-    surface: Surface,
-    light: Lit,
-    atlas: Plane,
-    pixel2: np.float32,
+    canvas: Canvas, look: Look, optics: Optics, body: Body, rectangle: NDArray[np.int32]
 ) -> None:
     """Shade an obstacle in a rectangle of the image.
 
     A box's pattern begins in the middle of each face. A cylinder's goes round it in a whole number
     of periods, a sphere's by longitude and latitude.
     """
-    cos, sin = (math.cos(yaw), math.sin(yaw)) if shape == primitives.BOX else (1.0, 0.0)
-    pose = primitives.turned(world, cos, sin)
+    shape, half, light, points = body.shape, body.half, look.light, canvas.points
+    ids, far, lines, xs = canvas.ids, canvas.far, optics.lines, optics.xs
+    surface = surface_of(look, OBSTACLE_ROW + body.number)
+    cos, sin = (math.cos(body.yaw), math.sin(body.yaw)) if shape == primitives.BOX else (1.0, 0.0)
+    pose = primitives.turned(body.pose, cos, sin)
     c0, c1, c2 = F32(pose.center[0]), F32(pose.center[1]), F32(pose.center[2])
     r = along32(pose)
     s0 = F32(cos * light.to_sun[0] + sin * light.to_sun[1])
     s1 = F32(cos * light.to_sun[1] - sin * light.to_sun[0])
     s2 = light.to_sun[2]
     per0, per1, per2 = F32(1.0 / half[0]), F32(1.0 / half[1]), F32(1.0 / half[2])
-    texel, radius = patterns.texels2(surface, pixel2), F32(half[0])
+    texel, radius = shading.texels2(surface, look.pixel2), F32(half[0])
     per_m, begin_u, begin_v = surface.per_m, surface.offset[0], surface.offset[1]
-    per_turn = patterns.periods_around(half[0], per_m)
+    per_turn = shading.periods_around(half[0], per_m)
     place, facing, ups = points.place, points.facing, points.up
-    own = I32(primitives.OBSTACLE + number)
+    own = I32(primitives.OBSTACLE + body.number)
     for v in range(rectangle[0], rectangle[1]):
         line = v * len(xs)
         low, high = line + rectangle[2], line + rectangle[3]
@@ -240,7 +205,7 @@ def shade_obstacle(
         if shape == primitives.BOX:
             for u in range(end - left):
                 t = far_row[u]
-                n, e, d = ray32(pose, r, bent, v, first + u, start, F32(x_row[u]))
+                n, e, d = ray32(pose, r, optics.bent, v, first + u, start, F32(x_row[u]))
                 a, b, c = t * n - c0, t * e - c1, t * d - c2
                 qa, qb, qc = abs(a) * per0, abs(b) * per1, abs(c) * per2
                 on_c = qc >= max(qa, qb)
@@ -250,36 +215,109 @@ def shade_obstacle(
                 to_sun = s2 if on_c else (s0 if on_a else s1)
                 to_sun = to_sun if outward > ZERO else -to_sun
                 up = ONE if c < ZERO else -ONE
-                across, along = patterns.on_box(a, b, c, on_c, on_a)
-                texels = texel * t * t / max(abs(normal), patterns.STEEP)
+                across, along = shading.on_box(a, b, c, on_c, on_a)
+                texels = texel * t * t / max(abs(normal), shading.STEEP)
                 place[u] = texel_at(across * per_m + begin_u, along * per_m + begin_v, texels)
                 facing[u] = max(to_sun, ZERO)
                 ups[u] = up if on_c else ZERO
         elif shape == primitives.CYLINDER:
             for u in range(end - left):
                 t = far_row[u]
-                n, e, d = ray32(pose, r, bent, v, first + u, start, F32(x_row[u]))
+                n, e, d = ray32(pose, r, optics.bent, v, first + u, start, F32(x_row[u]))
                 a, b, c = t * n - c0, t * e - c1, t * d - c2
                 cap = abs(c) * per2 * radius >= np.sqrt(a * a + b * b)
                 normal = d if cap else (a * n + b * e) * per0
                 vertical = s2 if c > ZERO else -s2
                 to_sun = vertical if cap else (a * s0 + b * s1) * per0
                 up = ONE if c < ZERO else -ONE
-                across, along = patterns.on_cylinder(a, b, c, cap, per_m, per_turn)
-                texels = texel * t * t / max(abs(normal), patterns.STEEP)
+                across, along = shading.on_cylinder(a, b, c, cap, per_m, per_turn)
+                texels = texel * t * t / max(abs(normal), shading.STEEP)
                 place[u] = texel_at(across + begin_u, along + begin_v, texels)
                 facing[u] = max(to_sun, ZERO)
                 ups[u] = up if cap else ZERO
         else:
             for u in range(end - left):
                 t = far_row[u]
-                n, e, d = ray32(pose, r, bent, v, first + u, start, F32(x_row[u]))
+                n, e, d = ray32(pose, r, optics.bent, v, first + u, start, F32(x_row[u]))
                 a, b, c = t * n - c0, t * e - c1, t * d - c2
                 normal = (a * n + b * e + c * d) * per0
                 to_sun = (a * s0 + b * s1 + c * s2) * per0
-                across, along = patterns.on_sphere(a, b, c, per_turn)
-                texels = texel * t * t / max(abs(normal), patterns.STEEP)
+                across, along = shading.on_sphere(a, b, c, per_turn)
+                texels = texel * t * t / max(abs(normal), shading.STEEP)
                 place[u] = texel_at(across + begin_u, along + begin_v, texels)
                 facing[u] = max(to_sun, ZERO)
                 ups[u] = min(max(-c * per0, -ONE), ONE)
-        paint(out, ids, lit, clear, left, end, own, own, points, surface, light, atlas)
+        paint(canvas, look, surface, left, end, own, own)
+
+
+@large_borrowing_kernel
+def shade_meshes(
+    canvas: Canvas,
+    look: Look,
+    optics: Optics,
+    rectangles: primitives.Rectangles,
+    meshes: Meshes,
+    faces: Faces,
+) -> None:
+    """Shade the visible flat triangles of meshes, with a pattern along the nearest mesh axis."""
+    for k in range(len(meshes.first)):
+        rectangle = rectangles[len(meshes.owner) + k, 0]
+        _shade_mesh(canvas, look, optics, rectangle, meshes, k, faces)
+
+
+@large_borrowing_kernel
+def _shade_mesh(
+    canvas: Canvas,
+    look: Look,
+    optics: Optics,
+    rectangle: NDArray[np.int32],
+    meshes: Meshes,
+    k: int,
+    faces: Faces,
+) -> None:
+    """Shade what is seen of mesh k in a rectangle (4,) of the image."""
+    ids, far, points, light = canvas.ids, canvas.far, canvas.points, look.light
+    lines, xs, axes, camera = optics.lines, optics.xs, optics.axes, optics.camera
+    surface = surface_of(look, material_row(meshes, k))
+    cos, sin = meshes.pose[k, 2], meshes.pose[k, 3]
+    offset = (
+        meshes.pose[k, 0] - camera[0],
+        meshes.pose[k, 1] - camera[1],
+        meshes.pose[k, 5] - camera[2],
+    )
+    pose = primitives.turned(Pose(axes.forward, axes.across, axes.along, offset), cos, sin)
+    c0, c1, c2 = F32(pose.center[0]), F32(pose.center[1]), F32(pose.center[2])
+    r = along32(pose)
+    s0 = F32(cos * light.to_sun[0] + sin * light.to_sun[1])
+    s1 = F32(cos * light.to_sun[1] - sin * light.to_sun[0])
+    s2 = light.to_sun[2]
+    texel, per_m = shading.texels2(surface, look.pixel2), surface.per_m
+    begin_u, begin_v = surface.offset[0], surface.offset[1]
+    normals = meshes.bvh.normals
+    own = I32(primitives.OBSTACLE + meshes.first[k])
+    for v in range(rectangle[0], rectangle[1]):
+        line = v * len(xs)
+        low, high = line + rectangle[2], line + rectangle[3]
+        left, end = span_of(ids, line, line + len(xs), low, high, own, own)
+        if end == 0:
+            continue
+        start = start32(pose, lines[v, 0], lines[v, 1])
+        for at in range(left, end):
+            u = at - left
+            if ids[at] != own:
+                # It is not painted; its place must only be one of the pattern.
+                points.place[u] = I32(1)
+                continue
+            t, i = far[at], faces[at]
+            n, e, d = ray32(pose, r, optics.bent, v, at - line, start, F32(xs[at - line]))
+            n0, n1, n2 = normals[i, 0], normals[i, 1], normals[i, 2]
+            normal = n0 * n + n1 * e + n2 * d
+            # The side that is seen faces the camera.
+            side = -ONE if normal > ZERO else ONE
+            a, b, c = t * n - c0, t * e - c1, t * d - c2
+            across, along = shading.on_triangle(a, b, c, n0, n1, n2)
+            texels = texel * t * t / max(abs(normal), shading.STEEP)
+            points.place[u] = texel_at(across * per_m + begin_u, along * per_m + begin_v, texels)
+            points.facing[u] = max(side * (n0 * s0 + n1 * s1 + n2 * s2), ZERO)
+            points.up[u] = -side * n2
+        paint(canvas, look, surface, left, end, own, own)

@@ -1,6 +1,6 @@
 """Textures: repeating patterns of numbers 0..1 with coarser levels (mip maps).
 
-A procedural pattern depends on its name alone; a picture from a file is three patterns. Surfaces
+A procedural pattern depends on its name alone. A picture from a file is three patterns. Surfaces
 differ in offset, size and albedos. Files are untrusted: two formats, of a size checked first.
 """
 
@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from airl_mav.arena.appearance import TEXTURES, Finish, image_number, linear_of
 from airl_mav.core.errors import UsageError
-from airl_mav.profiles.image_file import MOST_IMAGES, ImageFile
-from airl_mav.profiles.mesh_file import read_checked
+from airl_mav.profiles.asset_files import MOST_IMAGES, ImageFile, read_checked
 
 Floats = NDArray[np.float64]
 
@@ -30,11 +29,7 @@ LEAST_PX, MOST_PX = 2, 4096
 
 @lru_cache(maxsize=2 * MOST_IMAGES)
 def texels_of(file: ImageFile, side: int) -> Floats:
-    """Return a picture (side, side, 3) in linear RGB 0..1, area-averaged or interpolated; cached.
-
-    Raises:
-        UsageError: It cannot be read, has changed, or cannot be a texture.
-    """
+    """Return a picture (side, side, 3) in linear RGB 0..1, resized; cached. Raises UsageError."""
     # Imported here: who flies without a simulation has no pictures to read.
     from PIL import Image
 

@@ -16,7 +16,7 @@ from airl_mav.core.console import new_console
 from airl_mav.core.errors import FieldError
 from airl_mav.experiments.quantisation import export_int8
 from airl_mav.policy.card import CARD_FILE, ONNX_FILE, PolicyCard
-from airl_mav.policy.copying import copy_policy
+from airl_mav.policy.card_writing import copy_policy
 from airl_mav.policy.registry import find_policy
 from airl_mav.training.export_request import FLOWN, ExportRequest
 

@@ -27,10 +27,9 @@ from airl_mav.core.frames import quat_from_euler
 from airl_mav.core.progress import RichProgress
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.camera import Coefficients
-from airl_mav.profiles.camera_kind import Renderer
+from airl_mav.profiles.camera_kind import Projection, Renderer, check_fov
 from airl_mav.profiles.distortion import UNDISTORTED, check_distortion
 from airl_mav.profiles.loading import load_profile
-from airl_mav.profiles.projection import Projection, check_fov
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.rehearsal.run_folder import load
 from airl_mav.report import camera_pictures, ground_truth

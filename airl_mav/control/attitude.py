@@ -1,7 +1,8 @@
-"""Thrust vector and heading -> attitude setpoint -> body rate setpoint.
+"""Thrust vector and heading -> attitude setpoint -> body rate setpoint -> normalized torque.
 
 The structure of PX4's AttitudeControl (Brescianini, Hehn, D'Andrea, Nonlinear Quadrocopter
-Attitude Control, ETH 2013): the thrust axis is turned first, the heading with a reduced weight.
+Attitude Control, ETH 2013). The thrust axis is turned first, the heading with a reduced weight.
+The body rate PID is PX4's RateControl.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import math
 
 from airl_mav.control.gains import Gains
 from airl_mav.control.velocity import clamp
+from airl_mav.core.constants import DEG
 from airl_mav.core.kernels import kernel
 from airl_mav.vehicle.rotation import Quat, Vec, conjugate, multiply, normalize, rotate
 
@@ -87,10 +89,7 @@ def _shortest(a: Vec, b: Vec) -> Quat:
 
 @kernel
 def rate_setpoint(q: Quat, q_sp: Quat, yaw_rate_ff: float, gains: Gains) -> Vec:
-    """Return the body rates FRD [rad/s] that turn attitude q (body -> NED) into q_sp.
-
-    `yaw_rate_ff` is a heading rate about the world's down axis [rad/s].
-    """
+    """Return the body rates FRD [rad/s] from attitude q to q_sp, heading rate fed forward."""
     reduced, half_turn = reduced_attitude(q, q_sp)
     return rates_towards(q, reduced, weighted_turn(half_turn, gains), yaw_rate_ff, gains)
 
@@ -122,12 +121,8 @@ def rates_towards(
 ) -> Vec:
     """Return the body rates FRD [rad/s] that turn q into an attitude.
 
-    Args:
-        q: Body -> NED.
-        reduced: The attitude but for a turn about its thrust axis, body -> NED.
-        half_turn: The sine of half that turn.
-        yaw_rate_ff: Heading rate about the world's down axis [rad/s].
-        gains: Gains and limits.
+    `reduced` is that attitude but for a turn about its thrust axis, `half_turn` the sine of half
+    that turn, `yaw_rate_ff` the heading rate about the world's down axis [rad/s].
     """
     wanted = multiply(reduced, (math.sqrt(1.0 - half_turn * half_turn), 0.0, 0.0, half_turn))
     error = multiply(conjugate(q), wanted)
@@ -141,4 +136,45 @@ def rates_towards(
         clamp(p, -gains.rate_max_roll, gains.rate_max_roll),
         clamp(r, -gains.rate_max_pitch, gains.rate_max_pitch),
         clamp(y, -gains.rate_max_yaw, gains.rate_max_yaw),
+    )
+
+
+# Integration fades out towards this rate error: no wind-up in fast flips (PX4's RateControl).
+I_FADE_RAD_S = 400.0 * DEG
+
+
+@kernel
+def _integrate(integral: float, error: float, gain: float, limit: float, dt: float) -> float:
+    fade = error / I_FADE_RAD_S
+    return clamp(integral + max(0.0, 1.0 - fade * fade) * gain * error * dt, -limit, limit)
+
+
+@kernel
+def rate_control(
+    rates: Vec,
+    angular_acceleration: Vec,
+    rates_sp: Vec,
+    integral: Vec,
+    saturation: Vec,
+    gains: Gains,
+    dt: float,
+) -> tuple[Vec, Vec]:
+    """Return the torque setpoint (-1..1 per axis) and the new integral, in torque units.
+
+    Rates [rad/s] and their derivative [rad/s²] are filtered, FRD; `saturation` is the torque per
+    axis that the mixer could not deliver last time (its sign matters).
+    """
+    er, ep, ey = rates_sp[0] - rates[0], rates_sp[1] - rates[1], rates_sp[2] - rates[2]
+    torque = (
+        gains.rate_p_roll * er + integral[0] - gains.rate_d_roll * angular_acceleration[0],
+        gains.rate_p_pitch * ep + integral[1] - gains.rate_d_pitch * angular_acceleration[1],
+        gains.rate_p_yaw * ey + integral[2] - gains.rate_d_yaw * angular_acceleration[2],
+    )
+    er = 0.0 if er * saturation[0] > 0.0 else er
+    ep = 0.0 if ep * saturation[1] > 0.0 else ep
+    ey = 0.0 if ey * saturation[2] > 0.0 else ey
+    return torque, (
+        _integrate(integral[0], er, gains.rate_i_roll, gains.rate_int_max_roll, dt),
+        _integrate(integral[1], ep, gains.rate_i_pitch, gains.rate_int_max_pitch, dt),
+        _integrate(integral[2], ey, gains.rate_i_yaw, gains.rate_int_max_yaw, dt),
     )

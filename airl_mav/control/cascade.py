@@ -1,7 +1,7 @@
 """The whole cascade, one tick: state and setpoint -> motor commands.
 
 The loops hand over to each other as PX4's do in lockstep. The position loop runs whenever its
-estimator publishes a position, at every second sample of the IMU; each loop flies the setpoint
+estimator publishes a position, at every second sample of the IMU. Each loop flies the setpoint
 that the loop above it published at an earlier sample, as the inner ones are scheduled first. From
 a new position to the motors that takes two ticks.
 
@@ -13,10 +13,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from airl_mav.control.attitude import attitude_setpoint, heading_of, rate_setpoint
+from airl_mav.control.attitude import attitude_setpoint, heading_of, rate_control, rate_setpoint
 from airl_mav.control.demand import AttitudeDemand, Demand, RateDemand, TrajectoryDemand
 from airl_mav.control.gains import Gains
-from airl_mav.control.low_pass import Biquad, butterworth, filtered, weight
 from airl_mav.control.memory import (
     ATTITUDE_SP,
     DGYRO,
@@ -36,12 +35,15 @@ from airl_mav.control.memory import (
     WAIT,
     YAW_RATE_SP,
     YAW_TORQUE,
+    Biquad,
     Memory,
+    butterworth,
+    filtered,
     settle_gyro_filter,
     three,
+    weight,
 )
 from airl_mav.control.mixer import Motors, mix
-from airl_mav.control.rate import rate_control
 from airl_mav.control.velocity import (
     acceleration_control,
     velocity_control,
@@ -105,18 +107,10 @@ def cascade_tick(
     weights: Filters,
     dt: float,
 ) -> Output:
-    """Run one tick of the cascade; updates `memory` in place.
+    """Run one tick of dt [s] of the cascade; updates `memory`, a vehicle's row, in place.
 
-    Args:
-        position: NED [m].
-        velocity: NED [m/s].
-        q: Attitude body -> NED.
-        omega: Body rates FRD [rad/s].
-        demand: What to fly.
-        memory: Row of this vehicle.
-        gains: Gains and limits.
-        weights: `filters(gains, dt)`: the same at every tick.
-        dt: Tick [s].
+    Position [m] and velocity [m/s] are NED, q is body -> NED, omega the body rates FRD [rad/s];
+    `weights` are `filters(gains, dt)`.
     """
     first = start(velocity, omega, memory, weights)
     # Setpoints published by an outer loop take effect at the next tick, except at the very first.
@@ -165,7 +159,7 @@ def attitude_tick(
     weights: Filters,
     dt: float,
 ) -> Output:
-    """Run the attitude and the rate loop alone; the position loop is due when it is wanted again.
+    """Run the attitude and the rate loop alone. The position loop is due when it is wanted again.
 
     The velocity setpoint of the output is NaN.
     """
@@ -391,13 +385,7 @@ def torque_setpoint(
 ) -> Vec:
     """Return the torque -1..1 per axis that turns as wanted, and advance the loop's filters.
 
-    Args:
-        omega: Body rates FRD [rad/s].
-        rates_sp: Those wanted [rad/s].
-        memory: Row of this vehicle; its `SAT` is of the mixer's last tick.
-        gains: Gains and limits.
-        weights: `filters(gains, dt)`.
-        dt: Tick [s].
+    Rates are FRD [rad/s]; the `SAT` of `memory` is that of the mixer's last tick.
     """
     rates_now = (omega[0], omega[1], omega[2])
     for i in range(3):

@@ -1,21 +1,71 @@
 """What the cascade remembers of a vehicle between two ticks: a row of `MEMORY_SIZE` floats.
 
-N vehicles are an (N, MEMORY_SIZE) array, and the flight controller holds a single row.
+N vehicles are an (N, MEMORY_SIZE) array, and the flight controller holds a single row. The low-pass
+filters are those of PX4's control loops: AlphaFilter and LowPassFilter2p.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.control.gains import Gains
-from airl_mav.control.low_pass import Biquad, settled
 from airl_mav.control.mixer import PITCH, ROLL, Motors
 from airl_mav.core.constants import GRAVITY_M_S2
 from airl_mav.core.kernels import kernel
 from airl_mav.vehicle.rotation import Vec
+
+
+class Biquad(NamedTuple):
+    """Coefficients of a second-order filter in direct form II."""
+
+    b0: float
+    b1: float
+    b2: float
+    a1: float
+    a2: float
+
+
+LEAST_CUTOFF = 0.001
+"""A lower cut-off of a second-order filter is raised to this share of the sample rate, as in PX4's
+LowPassFilter2p: below it, the filter's coefficients cancel to rounding noise."""
+
+
+@kernel
+def weight(cutoff_hz: float, dt: float) -> float:
+    """Return the weight of a new sample in a first-order low-pass; cut-off 0 = no filter."""
+    if cutoff_hz <= 0.0:
+        return 1.0
+    return dt / (dt + 1.0 / (2.0 * math.pi * cutoff_hz))
+
+
+@kernel
+def butterworth(cutoff_hz: float, dt: float) -> Biquad:
+    """Return a second-order Butterworth low-pass; a cut-off of 0 or above Nyquist's = no filter."""
+    if cutoff_hz <= 0.0 or cutoff_hz >= 0.5 / dt:
+        return Biquad(1.0, 0.0, 0.0, 0.0, 0.0)
+    ohm = math.tan(math.pi * max(cutoff_hz, LEAST_CUTOFF / dt) * dt)
+    damping = 2.0 * math.cos(math.pi / 4.0) * ohm
+    c = 1.0 + damping + ohm * ohm
+    b = ohm * ohm / c
+    return Biquad(b, 2.0 * b, b, 2.0 * (ohm * ohm - 1.0) / c, (1.0 - damping + ohm * ohm) / c)
+
+
+@kernel
+def settled(f: Biquad, sample: float) -> float:
+    """Return what both delay elements hold in the steady state of a constant `sample`."""
+    return sample / (1.0 + f.a1 + f.a2)
+
+
+@kernel
+def filtered(f: Biquad, sample: float, newer: float, older: float) -> tuple[float, float]:
+    """Return the output and the next value of the newer delay element; the older takes `newer`."""
+    now = sample - f.a1 * newer - f.a2 * older
+    return f.b0 * now + f.b1 * newer + f.b2 * older, now
+
 
 Memory = NDArray[np.float64]
 
@@ -46,14 +96,9 @@ def new_memory(n: int | None = None) -> Memory:
 def trim_for_hover(
     memory: Memory, command: float, gains: Gains, north: float = 0.0, east: float = 0.0
 ) -> None:
-    """Set the integrals of the velocity to what they settle at in a hover.
+    """Set the integrals of the velocity to their steady values in a hover at a collective 0..1.
 
-    Args:
-        memory: Of one vehicle (MEMORY_SIZE,), updated.
-        command: Collective 0..1.
-        gains: Hold the hover thrust.
-        north: Acceleration that the vehicle leans for, against the wind [m/s²].
-        east: The same towards east.
+    `north` and `east` are the acceleration that the vehicle leans for, against the wind [m/s²].
     """
     # thrust_from_acceleration, solved for the acceleration that gives the command.
     upright = GRAVITY_M_S2 / math.hypot(GRAVITY_M_S2, north, east)
@@ -64,13 +109,7 @@ def trim_for_hover(
 
 
 def trim_against_torque(memory: Memory, motors: Motors, gains: Gains) -> None:
-    """Set the integrals of roll and pitch to what they settle at with these commands in a hover.
-
-    Args:
-        memory: Of one vehicle (MEMORY_SIZE,), updated.
-        motors: Commands 0..1; equal ones need no torque.
-        gains: Hold the limits of the integrals, and how torque becomes commands.
-    """
+    """Set the integrals of roll and pitch to their steady values in a hover at commands 0..1."""
     axes = (
         (ROLL, gains.mix_roll, gains.rate_int_max_roll),
         (PITCH, gains.mix_pitch, gains.rate_int_max_pitch),

@@ -66,10 +66,7 @@ def _in_range(m: Motors) -> bool:
 
 @kernel
 def mix(thrust: float, torque: Vec, gains: Gains) -> tuple[Motors, Vec]:
-    """Return motor commands 0..1 and the torque that could not be delivered, per axis.
-
-    `thrust` is the collective 0..1, `torque` the normalised roll, pitch and yaw torque, -1..1.
-    """
+    """Return motor commands 0..1 for thrust 0..1 and torque -1..1, and the missing torque."""
     motors, fits = allocate(thrust, torque, gains)
     if fits:
         return motors, (0.0, 0.0, 0.0)  # the usual case

@@ -60,7 +60,7 @@ def velocity_setpoint(position: Vec, position_sp: Vec, velocity_ff: Vec, gains: 
 def thrust_from_acceleration(acc: Vec, gains: Gains) -> Vec:
     """Return the thrust vector NED (normalised, hover = hover_thrust) for an acceleration [m/s²].
 
-    Horizontal and vertical acceleration are decoupled (MPC_ACC_DECOUPLE = 1): the tilt follows
+    Horizontal and vertical acceleration are decoupled (MPC_ACC_DECOUPLE = 1). The tilt follows
     from the horizontal part alone, limited to tilt_max.
     """
     # body_z (down) points against the horizontal acceleration: (-ax, -ay, g), normalised
@@ -88,7 +88,7 @@ def velocity_control(
     """Return the thrust vector (3,) NED and the new integral (3,) [m/s²].
 
     A NaN horizontal setpoint is not controlled: the vehicle stays level.
-    PID on velocity with anti-windup: vertical integration stops at the thrust limits; horizontal
+    PID on velocity with anti-windup: vertical integration stops at the thrust limits. Horizontal
     integration is pulled back by what saturation takes away (tracking anti-windup, gain 2/P).
     """
     ex = velocity_sp[0] - velocity[0]

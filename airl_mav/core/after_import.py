@@ -10,12 +10,7 @@ from typing import Any
 
 
 def after_import(package: str, ours: str) -> None:
-    """Import a module of ours as soon as a package is imported: now, if it has been already.
-
-    Args:
-        package: Name of the package. It need not be installed.
-        ours: The module. It is imported when the package is there whole.
-    """
+    """Import our module `ours` once `package`, which need not be installed, is imported whole."""
     if package in sys.modules:
         importlib.import_module(ours)
     else:

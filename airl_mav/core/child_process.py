@@ -70,17 +70,12 @@ class ChildProcess:
         environment: Mapping[str, str] | None = None,
         inherited: Sequence[int] = (),
     ) -> None:
-        """Start it.
+        """Start a program.
 
-        Args:
-            argv: Program and arguments.
-            log: What it prints is appended here.
-            guarded: Whether it needs the parent-death guard: it does not read the pipe itself.
-            capture_stdout: Whether its standard output is read by the parent (`stdout`), and only
-                its standard error goes to the log.
-            cwd: Its working directory; None = ours.
-            environment: Added to our own environment.
-            inherited: File descriptors that it inherits and never uses: locks.
+        What it prints is appended to `log`. With `capture_stdout` only its standard error is, and
+        the parent reads its standard output (`stdout`). It needs the parent-death guard (`guarded`)
+        unless it reads its pipe itself. `environment` is added to our own. File descriptors in
+        `inherited` are locks that it never uses.
         """
         guard = [sys.executable, "-m", "airl_mav.core.child_process"] if guarded else []
         path = {"PYTHONPATH": os.pathsep.join(sys.path)} if guarded else {}
@@ -137,10 +132,7 @@ class ChildProcess:
             suspension.end()
 
     def stop(self) -> None:
-        """Close its pipe, wait, then terminate, then kill; returns when it is gone.
-
-        Harmless when called again.
-        """
+        """Close its pipe, wait, terminate, kill; return when it is gone. Harmless if repeated."""
         self.resume()
         if self.stdin is not None:
             with suppress(BrokenPipeError):

@@ -29,12 +29,7 @@ class Clock(Protocol):
         ...
 
     def sleep_until(self, time_us: int, interrupt: threading.Event | None = None) -> None:
-        """Return once `time_us()` has reached the given simulated time [µs].
-
-        Args:
-            time_us: Until when [µs].
-            interrupt: Ends the sleep early when it is set.
-        """
+        """Return once `time_us()` has reached a time [µs], or early when `interrupt` is set."""
         ...
 
 
@@ -68,11 +63,9 @@ class WallClock:
     """
 
     def __init__(self, speed: float = 1.0, epoch_ns: int | None = None) -> None:
-        """Start at 0, or share another clock's epoch.
+        """Start at simulated time 0 now, or at another clock's epoch (host monotonic time [ns]).
 
-        Args:
-            speed: Simulated seconds per wall second, > 0.
-            epoch_ns: Host monotonic time [ns] of simulated time 0; None means now.
+        `speed` is simulated seconds per wall second, > 0.
         """
         if not speed > 0.0:
             raise ValueError(f"speed={speed}: must be > 0")
@@ -129,15 +122,11 @@ def utc_now() -> datetime:
 def since_1970_us(timestamp: str) -> int:
     """Return a calendar time, written as ISO 8601 with its offset from UTC, since 1970 [µs].
 
-    Raises:
-        ValueError: The text is no such time.
+    Raises ValueError if the text is no such time.
     """
     return round(datetime.fromisoformat(timestamp).timestamp() * US_PER_S)
 
 
 def utc_us() -> int:
-    """Return the calendar time since 1970 [µs], for stamps that a driver took from it.
-
-    It may jump, so nothing waits by it.
-    """
+    """Return the calendar time since 1970 [µs], for stamps. It may jump: nothing waits by it."""
     return time.time_ns() // NS_PER_US

@@ -1,6 +1,6 @@
 """Where commands print: rich's console, without its markup.
 
-What is printed are paths, names and messages of others: brackets in them are brackets, not styles,
+What is printed are paths, names and messages of others. Brackets in them are brackets, not styles,
 and `:name:` is no emoji. Who wants a style gives it by name.
 """
 
@@ -19,15 +19,7 @@ def new_console(
     file: IO[str] | None = None,
     width: int | None = None,
 ) -> Console:
-    """Return a console.
-
-    Args:
-        stderr: It writes to standard error, not to standard output.
-        quiet: It writes nothing.
-        soft_wrap: Lines longer than the terminal stay whole.
-        file: It writes there instead.
-        width: Columns; None: those of the terminal.
-    """
+    """Return a console; with `soft_wrap`, lines longer than the terminal stay whole."""
     return Console(
         stderr=stderr,
         quiet=quiet,

@@ -64,5 +64,5 @@ Level = Literal["gym", "lockstep", "sitl", "hil", "firmware", "flight"]
 CommandKind = Literal["velocity", "attitude", "body_rates"]
 """What a policy commands: all actions of one are of one kind."""
 UNMEASURED_A: Final = -1.0
-"""What PX4 tells as the battery's current where its monitor measures none [A]; its simulated one
+"""What PX4 tells as the battery's current where its monitor measures none [A]. Its simulated one
 does not. Source: PX4 1.16, msg/versioned/BatteryStatus.msg, current_a."""

@@ -63,14 +63,10 @@ class _Home:
 
 @contextmanager
 def held_to(percent: float | None, root: Path = Path("/")) -> Iterator[CpuGroup | None]:
-    """Limit this process, with its threads and future children, to a share of a core.
+    """Limit this process, with its threads and future children, to a share of a core [%].
 
-    Args:
-        percent: Share of one core [%]: 100 is one core, 200 two. None: no limit.
-        root: Where /proc and /sys are found.
-
-    Raises:
-        UsageError: The system does not permit it; says why.
+    None is no limit; `root` is where /proc and /sys are found. Raises UsageError if the system does
+    not permit it.
     """
     if percent is None:
         yield None

@@ -48,13 +48,10 @@ class FieldError(UsageError):
     def __init__(
         self, field: str, value: object = MISSING, accepted: str = "", problem: str = ""
     ) -> None:
-        """Describe a field.
+        """Describe a field by its dotted path, "" for the whole, and the value that was given.
 
-        Args:
-            field: Dotted path of the field; "" for the whole.
-            value: What was given, `MISSING` when nothing was or when it would not help.
-            accepted: What would have been accepted: "0 < value <= 10 s".
-            problem: What is wrong, where that says more than what is accepted.
+        The value is `MISSING` when there was none or when it would not help. `accepted` is a range
+        such as "0 < value <= 10 s"; `problem` replaces it where it says more.
         """
         # All arguments, so that the error can be pickled between processes.
         super().__init__(field, value, accepted, problem)
@@ -66,10 +63,8 @@ class FieldError(UsageError):
     def line(self, name: str | None = None, sign: str = " ") -> str:
         """Return the message in one line: "NAME VALUE: accepted: RANGE".
 
-        Args:
-            name: What to call the field, an option, whose value is then shown as it was typed;
-                None: its dotted path.
-            sign: What stands between name and value; " = " in messages about files.
+        `name` is that of an option, whose value is shown as typed; None: the dotted path. `sign`
+        stands between name and value, " = " in messages about files.
         """
         where = self.field if name is None else name
         if self.value is not MISSING:

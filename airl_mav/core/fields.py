@@ -88,15 +88,8 @@ def quantity(
 ) -> Any:
     """Declare a number, an optional number or a list of numbers, with its unit and range.
 
-    Args:
-        description: What the number means.
-        unit: Its unit, "1" when it has none.
-        ge: Least value allowed.
-        gt: Value that it must exceed.
-        le: Greatest value allowed.
-        lt: Value that it must stay below.
-        default: Value when it is left out; none means that it is required.
-        later: It is dumped as `later_field` says.
+    The unit is "1" for plain numbers. A field without a default is required. A field that came
+    `later` is dumped as `later_field` says.
     """
     scalar = any(bound is not None for bound in (ge, gt, le, lt))
     return Field(
@@ -113,14 +106,21 @@ def quantity(
     )
 
 
+def optional(description: str) -> Any:
+    """Declare a field that is None unless it is given."""
+    return Field(default=None, description=description)
+
+
+def switch(description: str) -> Any:
+    """Declare a switch that is off unless it is given."""
+    return Field(default=False, description=description)
+
+
 def later_field(default: Any, description: str | None = None) -> Any:
     """Declare a field that came later than digests and cards of such models.
 
-    Where it is as by default it is left out of what is dumped: they stay as they were without it.
-
-    Args:
-        default: Its value when it is left out, or the type that makes one.
-        description: What it means; None: its type tells.
+    A value equal to the default is left out of the dump, so that digests and cards stay as they
+    were. The default may be the type that makes one.
     """
     made = default() if isinstance(default, type) else default
     given: dict[str, Any] = (
@@ -211,17 +211,7 @@ def _branch_marks(annotation: Any) -> list[Any]:
 
 
 def validated(model: type[Model], data: object, source: object = None) -> Model:
-    """Return data as a model.
-
-    Args:
-        model: The model.
-        data: What was read or given.
-        source: The file, or the options, that it comes from, for messages about it.
-
-    Raises:
-        UsageError: A field is missing, unknown, of the wrong type or out of range; a `FieldError`
-            where there is no source to name.
-    """
+    """Return data as a model. Raises UsageError naming `source`; without it the `FieldError`."""
     try:
         return model.model_validate(data)
     except ValidationError as error:
@@ -236,10 +226,8 @@ def validated(model: type[Model], data: object, source: object = None) -> Model:
 def field_error(error: ValidationError, model: type[BaseModel] | None = None) -> FieldError:
     """Return the first finding of a failed validation as an error of one line.
 
-    Args:
-        error: What pydantic raised.
-        model: The model that was validated, whose fields say their ranges and names; None for
-            anything else that pydantic validates, a dataclass above all.
+    The fields of `model` give ranges and names; None for anything else that pydantic validates, a
+    dataclass above all.
     """
     findings = error.errors(include_url=False)
     # A misspelt field also goes missing: its misspelling says more.
@@ -308,10 +296,7 @@ def _dotted(model: type[BaseModel] | None, path: tuple[int | str, ...]) -> str:
 
 
 def _choices(field: FieldInfo) -> dict[str, type[BaseModel]]:
-    """Return the models that a field chooses from by the value of one of theirs; mostly none.
-
-    Those, too, of which it holds several.
-    """
+    """Return the models, of which a field holds one or several, that a value selects."""
     name, union = field.discriminator, field.annotation
     for part in _annotated_parts(field.annotation):
         for mark in part.__metadata__:

@@ -44,9 +44,8 @@ DEEPEST = 100
 def replace_file(path: Path, data: bytes) -> None:
     """Write a file so that a reader sees the old one or the whole new one, never a part.
 
-    Raises:
-        OSError: It cannot be written, a full disk above all; its `filename` is the path. The old
-            file is untouched, and nothing is left beside it.
+    Raises OSError if it cannot be written, a full disk above all. Its `filename` is the path. The
+    old file is untouched, and nothing is left beside it.
     """
     with replacing(path) as partial:
         partial.write_bytes(data)
@@ -54,11 +53,7 @@ def replace_file(path: Path, data: bytes) -> None:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Yield the temporary name of a file; on leaving it takes the place of `path`.
-
-    Raises:
-        OSError: As `replace_file`.
-    """
+    """Yield the temporary name of a file, which then replaces `path`. Raises as `replace_file`."""
     partial = path.with_name(path.name + ".partial")
     try:
         with naming(path):
@@ -119,13 +114,9 @@ def write_json(path: Path, data: Mapping[str, Any]) -> None:
 def read_json(path: Path, schema: int | None, what: str) -> dict[str, Any]:
     """Return the object that a file holds, without its CRC.
 
-    Args:
-        path: The file.
-        schema: Version that is understood: the object's field `schema`; None where it has none.
-        what: What the file's folder would hold, for messages.
-
-    Raises:
-        UsageError: The file is missing, no JSON, damaged, or of another version.
+    `schema` is the accepted value of its field `schema`, None where it has none; `what` is the
+    folder's content, for messages. Raises UsageError if the file is missing, no JSON, damaged, or
+    of another version.
     """
     try:
         data = path.read_bytes()
@@ -151,7 +142,7 @@ def typed(adapter: TypeAdapter[T], data: Mapping[str, Any], source: object) -> T
 
 
 def append_lines(path: Path, objects: Iterable[Mapping[str, Any]]) -> None:
-    """Append objects to a file of JSON lines; on return they are on the disk.
+    """Append objects to a file of JSON lines. On return they are on the disk.
 
     Raises:
         ValueError: A NaN or an infinity.
@@ -179,13 +170,7 @@ def read_lines(path: Path, schema: int | None) -> list[tuple[str, dict[str, Any]
     """Return the objects of a file of JSON lines, each with its place: "path:number".
 
     A last line without its newline was cut short by a kill and is passed over. No file, no objects.
-
-    Args:
-        path: The file.
-        schema: Version that is understood; None where lines have none.
-
-    Raises:
-        UsageError: A line is no JSON, damaged, or of another version.
+    `schema` and errors as of `read_json`.
     """
     *whole, rest = _read_if_there(path).split(b"\n")
     found = []
@@ -294,18 +279,11 @@ def save_arrays(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
 
 
 def add_arrays(path: Path, groups: Mapping[str, Mapping[str, NDArray[Any]]]) -> dict[str, str]:
-    """Add groups of arrays to an .npz; the file is the old one or the whole new one.
+    """Add groups of arrays to an .npz, made when there is none; return the CRC of each group.
 
-    The old archive is copied as bytes and appended to, so that adding costs a copy and not a second
-    compression of the whole run.
-
-    Args:
-        path: The archive; made when there is none.
-        groups: Arrays by name, by group; their keys become `<group>/<name>`. All that the archive
-            has of these groups is replaced.
-
-    Returns:
-        The CRC of each group, as `read_groups` finds it.
+    Keys become `<group>/<name>`. All that the archive has of these groups is replaced. The file is
+    the old one or the whole new one. The old archive is copied as bytes and appended to. So adding
+    costs a copy, not a second compression of the whole run.
     """
     with replacing(path) as partial:
         old = path.exists()
@@ -329,11 +307,7 @@ def add_arrays(path: Path, groups: Mapping[str, Mapping[str, NDArray[Any]]]) -> 
 
 
 def read_groups(path: Path) -> dict[str, ArrayGroup]:
-    """Return all groups of arrays of an archive; none when there is no file.
-
-    Raises:
-        UsageError: It cannot be read or is damaged.
-    """
+    """Return all groups of arrays of an archive, none without a file. Raises UsageError."""
     if not path.exists():
         return {}
     try:

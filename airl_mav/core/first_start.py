@@ -73,18 +73,10 @@ def compile_first(
     stop: Callable[[], bool] = lambda: False,
     workers: int | None = None,
 ) -> None:
-    """Compile the kernels of plans, unless that has been done.
+    """Compile the kernels of plans, unless all are cached; one process per core by default.
 
-    Takes as long as it takes. Nothing is shown where every kernel is in the cache.
-
-    Args:
-        plans: What is needed.
-        progress: Where to show it.
-        stop: Checked several times a second; True ends the step.
-        workers: Number of processes at a time; None: one a core.
-
-    Raises:
-        KeyboardInterrupt: Ctrl-C; what is compiled stays, and the next start resumes.
+    `stop` is polled several times a second; True ends the step. Ctrl-C (KeyboardInterrupt) keeps
+    what is compiled.
     """
     folder, missing = _missing(plans)
     if folder is None or not missing:
@@ -211,7 +203,6 @@ class _Running:
     reader: threading.Thread | None = None
     """Reads what it prints."""
     count: int = 0
-    """Kernels compiled so far."""
 
 
 class _Step:

@@ -10,7 +10,7 @@ pitch, roll (Z-Y-X, intrinsic).
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -113,10 +113,7 @@ def quats_to_euler(q: Vector) -> tuple[Vector, Vector, Vector]:
 
 
 def down_in_body(roll: Vector, pitch: Vector) -> Vector:
-    """Return where down is (..., 3), in body axes FRD, of vehicles with roll and pitch (...) [rad].
-
-    The last row of the rotation matrix body -> NED.
-    """
+    """Return down (..., 3) in body axes FRD at roll and pitch (...) [rad]."""
     level = np.cos(pitch)
     return np.stack([-np.sin(pitch), np.sin(roll) * level, np.cos(roll) * level], axis=-1)
 
@@ -165,7 +162,7 @@ def quat_wxyz_to_xyzw(q: Vector) -> tuple[float, float, float, float]:
 def ned_to_heading(v: Vector, yaw: float | Vector) -> Vector:
     """Rotate world vectors (..., 3) by yaw (...) into the heading frame (forward, right, down).
 
-    The heading frame is MAVLink's BODY_NED: yaw follows the vehicle, roll and pitch stay level.
+    The heading frame is MAVLink's BODY_NED. Yaw follows the vehicle, roll and pitch stay level.
     """
     c, s = np.cos(yaw), np.sin(yaw)
     north, east = v[..., 0], v[..., 1]
@@ -219,3 +216,14 @@ def geodetic_to_local(point: Geodetic, origin: Geodetic) -> Vector:
     east = k * math.cos(lat) * math.sin(dlon)
     down = origin.altitude_m - point.altitude_m
     return np.array([north * EARTH_RADIUS_M, east * EARTH_RADIUS_M, down])
+
+
+HOME: Final = Geodetic(47.397743, 8.545594, 489.4)
+"""Home of PX4 SITL: latitude, longitude [deg], altitude above mean sea level [m]."""
+
+MAGNETIC_FIELD_NED: Final[Vector] = np.array([0.2143, 0.0119, 0.4317])
+"""Earth's magnetic field at HOME [gauss]: 0.482 G, inclination 63.6°, declination 3.2°
+(World Magnetic Model 2020-2025)."""
+
+MAGNETIC_DECLINATION: Final = float(np.arctan2(MAGNETIC_FIELD_NED[1], MAGNETIC_FIELD_NED[0]))
+"""Angle from true to magnetic north at HOME [rad], positive east."""

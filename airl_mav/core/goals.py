@@ -14,12 +14,7 @@ negative."""
 
 
 def goal_distance_m(goal: Goal, position: Sequence[float] | NDArray[np.float64]) -> float:
-    """Return how far a position NED (3,) [m] is from a goal: seen from above, if it has no height.
-
-    Args:
-        goal: Where to fly.
-        position: Of the vehicle.
-    """
+    """Return the distance of a position NED (3,) from a goal [m]: level, if it has no height."""
     away = math.hypot(position[0] - goal[0], position[1] - goal[1])
     return away if len(goal) == 2 else math.hypot(away, position[2] - goal[2])
 

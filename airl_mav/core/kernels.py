@@ -111,27 +111,23 @@ def _caching_in(folder: Path | None) -> Iterator[None]:
 def kernel(function: F) -> F:
     """Compile a function with numba.
 
-    Compiled code is cached on disk, so that only the first start after an install pays for it, and
-    releases the GIL. Always inlined: numba would pass the forty gains by value at each call, which
-    costs a third of the batch twin's speed. Never `parallel`: one thread a process, processes for
-    parallelism.
+    Compiled code is cached on disk and releases the GIL. Only the first start after an install
+    compiles. Kernels are always inlined: numba would pass the forty gains by value at each call,
+    which costs a third of the batch twin's speed. They are never `parallel`: one thread a process,
+    processes for parallelism.
 
-    A division by zero gives infinity or NaN, as numpy's, and no ZeroDivisionError: looking out for
-    one at every division takes a tenth of the twin's speed, and keeps the compiler from vector
-    instructions.
+    A division by zero gives infinity or NaN, as numpy's. Checks for a ZeroDivisionError take a
+    tenth of the twin's speed, and prevent vector instructions.
 
-    numba stamps a cached function with its own file only: a kernel that inlines another one, or a
-    constant, from a changed file would go on running the old code, also after an upgrade of the
+    numba stamps a cached function with its own file only. A kernel that inlines another one, or a
+    constant, from a changed file would keep running the old code, also after an upgrade of the
     package. So each is kept in a folder of its file and of all that this imports.
     """
     return _compiled(function, forceinline=True)
 
 
 def large_kernel(function: F) -> F:
-    """Compile a function with numba, called and not inlined.
-
-    For what is long and rarely needed: inlined, it would be compiled again with each caller.
-    """
+    """Compile a function with numba, not inlined: it is long, and rarely needed."""
     return _compiled(function, forceinline=False)
 
 

@@ -16,31 +16,20 @@ _FLUSH_US = US_PER_S
 
 
 class LogFile:
-    """Takes whole records, and writes them at the latest after one second of simulated time.
+    """Writer of whole records, at the latest after one second of simulated time.
 
-    A killed process leaves a valid log under the temporary name that lacks its last second at
-    most. Nothing is kept in memory for longer.
-
-    A log that cannot be written any more, on a full disk, ends with its last whole record: whoever
-    logs goes on without it.
+    A killed process leaves a valid log under the temporary name. It lacks its last second at most.
+    A log that cannot be written any more, on a full disk, ends with its last whole record. The
+    program continues without it.
     """
 
     def __init__(self, path: Path, on_lost: Callable[[str], None] = lambda _: None) -> None:
-        """Open the file.
-
-        Args:
-            path: Its final name.
-            on_lost: Called once when it cannot be written any more: which file, and why.
-
-        Raises:
-            OSError: It cannot be opened.
-        """
+        """Open the file, or raise OSError. `on_lost` is called once if writing fails."""
         self.path = path
         self.on_lost = on_lost
         self.lost = False
         """Whether it ended early."""
         self.failure: OSError | None = None
-        """Why it did."""
         self.partial_path = path.with_name(path.name + PARTIAL_SUFFIX)
         self._buffer = bytearray()
         self._written = 0

@@ -2,7 +2,7 @@
 
 psutil reads what it knows; governor and throttling are read from where Linux and the Raspberry Pi's
 firmware offer them. None stands for what a system does not offer. psutil is imported where it is
-asked: the records of flights need this module, and whoever reads them asks nothing.
+asked. The records of flights need this module, and whoever reads them asks nothing.
 """
 
 from __future__ import annotations
@@ -75,12 +75,10 @@ class MachineState:
 def machine_state(
     root: Path = Path("/"), ask_pi: Callable[[], str | None] | None = None
 ) -> MachineState:
-    """Return the state of this machine.
+    """Return the state of this machine; psutil does not read governor and throttling.
 
-    Args:
-        root: Where /sys is found, for what psutil does not read: governor and throttling.
-        ask_pi: Returns what `vcgencmd get_throttled` says, None where there is no such program;
-            None asks it.
+    `root` is where /sys is found. `ask_pi` returns the output of `vcgencmd get_throttled`, None
+    where there is no such program; by default it is run.
     """
     import psutil
 

@@ -104,15 +104,11 @@ def is_loaded(door: Door, name: str) -> bool:
 
 
 def load_part(door: Door, name: str, fits: Callable[[Any], bool] = callable) -> Any:
-    """Return a part by any of its names. Its file or module is run, once in a process.
+    """Return a part by any of its names. Its file or module is run once in a process.
 
-    Args:
-        door: What kind of part.
-        name: FILE.py:NAME, MODULE:NAME, or a name of an installed package's.
-        fits: Whether what was found can be one.
-
-    Raises:
-        FieldError: There is no such file, module or part, its module raises, or it does not fit.
+    The name is FILE.py:NAME, MODULE:NAME, or a name of an installed package's; `fits` accepts or
+    rejects the part. Raises FieldError if there is no such file, module or part, its module raises,
+    or it does not fit.
     """
     found = reference(door, name)
     if found is None:
@@ -133,11 +129,7 @@ def load_part(door: Door, name: str, fits: Callable[[Any], bool] = callable) -> 
 
 
 def digest_of(found: str) -> str | None:
-    """Return the SHA-256 of the file that a FILE.py:NAME or MODULE:NAME lies in; None: in no file.
-
-    Raises:
-        OSError: It cannot be read.
-    """
+    """Return the SHA-256 of the file of a part; None: it is in no file. Raises OSError."""
     where = found.rpartition(":")[0]
     file: str | None = where
     if not names_file(found):

@@ -4,7 +4,7 @@ Looked for in this order, the first that answers counts:
 
 - INA2xx and INA3221 shunt monitors of hwmon (Jetson and other boards): `power*_input` [µW], or
   `in*_input` [mV] times `curr*_input` [mA]. A rail that feeds the whole board (`TOTAL_RAILS`)
-  counts alone; without one the rails are added up.
+  counts alone. Without one the rails are added up.
 - A battery that is being discharged: `power_now` [µW], or `current_now` [µA] times `voltage_now`
   [µV]. It feeds the whole machine.
 - RAPL (Intel, AMD): energy counters [µJ] of the processor packages and of the memory, or of the
@@ -51,11 +51,7 @@ class PowerSource(Protocol):
         ...
 
     def take_j(self, elapsed_s: float) -> float | None:
-        """Return the energy since the call before, or since it was made [J]; None: unreadable.
-
-        Args:
-            elapsed_s: How long ago that was [s].
-        """
+        """Return the energy of the last `elapsed_s`, since the call before [J]."""
         ...
 
 
@@ -120,11 +116,7 @@ class Rails:
 
 
 def find_power_source(root: Path = Path("/")) -> tuple[PowerSource | None, str]:
-    """Return what tells this machine's power, and its name; None, and why there is none.
-
-    Args:
-        root: Where /sys is found.
-    """
+    """Return this machine's power source, found below `root`/sys, and its name; None, and why."""
     found = _shunt_monitors(root) or _battery(root)
     if found is not None:
         return found, found.name

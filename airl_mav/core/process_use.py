@@ -1,7 +1,7 @@
 """What this process takes of its machine over a time: processor time, memory, and the power drawn.
 
 `VmHWM` of /proc/self/status is the greatest resident set since the process began. Writing 5 to
-/proc/self/clear_refs sets it back to the present one (Linux 4.0, proc(5)); where that is not
+/proc/self/clear_refs sets it back to the present one (Linux 4.0, proc(5)). Where that is not
 permitted, the peak stays that of the whole life of the process, and `ProcessUse.peak_since` says
 so.
 """

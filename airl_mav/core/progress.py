@@ -1,6 +1,6 @@
 """Progress of long work: bars and lines on a terminal, or nothing for callers of the Python API.
 
-Whoever does the work is given a `Progress`: it opens a `Bar` for what can be counted, says what is
+Whoever does the work is given a `Progress`. It opens a `Bar` for what can be counted, says what is
 done meanwhile, notes what a person should read and tells what a program should know. `RichProgress`
 draws; `json_progress` writes for programs.
 """
@@ -83,11 +83,8 @@ class Progress:
     ) -> Bar:
         """Open a bar.
 
-        Args:
-            label: What is being done.
-            total: How much of it there is.
-            completed: How much of it had been done before; does not count for the pace.
-            unit: What is counted, in the plural: shows the count and the pace. None: neither.
+        `completed` was done before and does not count for the pace. `unit`, in the plural, shows
+        count and pace; None: neither.
         """
         return Bar()
 
@@ -104,24 +101,14 @@ class Progress:
         """Print how far long work is, where no bar can be drawn."""
 
     def note(self, text: str, style: str | None = None) -> None:
-        """Print a line for a person; it stays when the bars are gone.
-
-        Args:
-            text: The line, taken literally.
-            style: A style of rich: "yellow" for what a person should know.
-        """
+        """Print a line, taken literally, that outlasts the bars; `style` is one of rich's."""
 
 
 class RichProgress(Progress):
     """Draws bars on an interactive console; notes are printed to any. Use as a context manager."""
 
     def __init__(self, console: Console, clock: Clock | None = None) -> None:
-        """Draw on a console.
-
-        Args:
-            console: Where to draw; without a terminal only notes are printed.
-            clock: Of elapsed and remaining time; None is the wall clock.
-        """
+        """Draw on a console; without a terminal only notes are printed."""
         self._console = console
         source = clock or WallClock()
         wide = console.width >= WIDE

@@ -44,11 +44,7 @@ def package_versions() -> dict[str, str]:
 
 
 def provenance(command: str) -> dict[str, Any]:
-    """Return with what something is being made now, as plain values.
-
-    Args:
-        command: The command line.
-    """
+    """Return versions, machine and commit of what a command makes now, as plain values."""
     return {
         "created_utc": utc_now().isoformat(timespec="seconds"),
         "command": command,
@@ -94,14 +90,7 @@ def _cpu_model() -> str:
 
 
 def git_state(checkout: Path | None = None) -> dict[str, Any] | None:
-    """Return the commit of a source checkout and whether it was changed.
-
-    Args:
-        checkout: Its folder; None is where this package lies.
-
-    Returns:
-        `commit` and `changed`, or None when this is no checkout or git is not there.
-    """
+    """Return `commit` and `changed` of a checkout, by default this package's; None without git."""
     root = checkout or Path(__file__).resolve().parents[2]
     git = shutil.which("git")
     if git is None or not (root / ".git").exists():

@@ -53,15 +53,12 @@ def _ask_for_slices(length_ns: int) -> None:
 
 
 def give_way(niceness: int) -> None:
-    """Let all others run before this process and what it starts from now on.
+    """Let all others run before this process and what it starts from now on; niceness 1 to 19.
 
-    Linux' autogroups share the processor out among sessions, and niceness counts only within one:
-    a nice process of one session takes half of what an urgent one of another could have. So this
-    process becomes a session of its own, and is nice as such, too (sched(7)). Short slices of
-    whoever has started it are no longer its own.
-
-    Args:
-        niceness: 1 to 19, the most.
+    Linux' autogroups share the processor out among sessions. Niceness counts only within one: a
+    nice process of one session takes half of what an urgent one of another could have. So this
+    process becomes a session of its own, and is nice as such, too (sched(7)). Short slices of its
+    parent are no longer its own.
     """
     os.nice(niceness)
     _ask_for_slices(0)

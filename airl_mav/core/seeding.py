@@ -43,12 +43,7 @@ class _Words(ISeedSequence):
 
 
 def seeded(seed: int, *key: int) -> np.random.Generator:
-    """Return what `default_rng(SeedSequence(seed, spawn_key=key))` returns, but that spawns none.
-
-    Args:
-        seed: Not negative.
-        key: Not negative; another generator for every other one.
-    """
+    """Return `default_rng(SeedSequence(seed, spawn_key=key))`, but one that spawns none."""
     numbers = (seed, *key)
     if not 0 <= min(numbers) <= max(numbers) < _ONE_WORD:
         return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=key))

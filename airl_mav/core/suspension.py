@@ -1,7 +1,7 @@
 """A process that is suspended, and surely resumed, also when whoever suspended it is killed.
 
 A stopped process does not see that the pipe from its parent has closed, and would be left behind
-for ever: while it is suspended, a guard reads a pipe for it.
+for ever. While it is suspended, a guard reads a pipe for it.
 """
 
 from __future__ import annotations

@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 from airl_mav.arena.appearance import OBSTACLE
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.colour import Work, render_colour
-from airl_mav.camera.fisheye import bent_of
 from airl_mav.camera.gloss import MATT, Gloss
 from airl_mav.camera.image_sensor import LIGHT_OF
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.lens_drops import draw_drops
 from airl_mav.camera.picture import ColourArrays, write_grey
-from airl_mav.camera.projection import Bent
+from airl_mav.camera.projection import Bent, bent_of
 from airl_mav.camera.render import Mount, camera_pose
 from airl_mav.camera.textures import atlas
 from airl_mav.core.errors import UsageError
@@ -25,7 +24,7 @@ from airl_mav.core.kernels import kernel
 from airl_mav.envs.arenas import ArenaBatch, copy_rows, move_obstacles, relief_of
 from airl_mav.envs.fleet import Fleet, Seen
 from airl_mav.envs.meshes import MeshBatch, MeshesSeen, meshes_in
-from airl_mav.profiles.image_file import ImageFile
+from airl_mav.profiles.asset_files import ImageFile
 
 
 class LookBatch(NamedTuple):

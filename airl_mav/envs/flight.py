@@ -96,8 +96,14 @@ from airl_mav.envs.fleet import (
     vec,
 )
 from airl_mav.vehicle.airframe import airframe_of
-from airl_mav.vehicle.battery import drain, open_circuit, terminal_voltage
-from airl_mav.vehicle.power import felt, felt_share, flight_power_w
+from airl_mav.vehicle.power import (
+    drain,
+    felt,
+    felt_share,
+    flight_power_w,
+    open_circuit,
+    terminal_voltage,
+)
 from airl_mav.vehicle.rigid_body import drag_force, step
 from airl_mav.vehicle.rotation import Vec, rotate
 from airl_mav.vehicle.rotor import settle, wrench

@@ -47,8 +47,7 @@ from airl_mav.envs.spec import SHIPPED_REWARDS, EnvironmentSpec
 from airl_mav.envs.stopping import injections_of
 from airl_mav.envs.trace import Trace
 from airl_mav.envs.world import World, decide, status
-from airl_mav.faults.model import Fault
-from airl_mav.faults.twin import check_twin
+from airl_mav.faults.model import Fault, check_twin
 from airl_mav.latency.injection import Injection
 from airl_mav.policy.actions import UPRIGHT_S
 from airl_mav.policy.images import Bytes, body_bytes
@@ -63,7 +62,7 @@ from airl_mav.profiles.loaded import check_spread, equipped
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.parameters import flown_values
 from airl_mav.profiles.vehicle import VehicleProfile
-from airl_mav.vehicle.spread import draw_airframe, spreads
+from airl_mav.vehicle.airframe import draw_airframe, spreads
 
 EVERYONE = slice(None)
 """The rows of all n vehicles."""

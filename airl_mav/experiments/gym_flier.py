@@ -24,7 +24,7 @@ from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec, spec_of
 from airl_mav.envs.trace import Trace
 from airl_mav.experiments.executors import FlyEpisodes, Stop
-from airl_mav.faults.twin import check_twin
+from airl_mav.faults.model import check_twin
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.quality import measure_quality
 from airl_mav.flight.record import EpisodeRecord, FaultActed

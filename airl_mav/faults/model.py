@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from pydantic import Field, field_validator, model_validator
 
-from airl_mav.core.fields import ProfileModel, quantity
-from airl_mav.faults.kinds import KINDS, LINKS, Kind, Part, Phase, kinds_of
-from airl_mav.faults.words import fault_text, read_fault
+from airl_mav.core.errors import FieldError
+from airl_mav.core.fields import ProfileModel, optional, quantity
+from airl_mav.faults.kinds import KINDS, LINKS, Kind, Part, Phase, fault_text, kinds_of, read_fault
 
 LONGEST_S = 100_000.0
 
@@ -18,8 +18,7 @@ LONGEST_S = 100_000.0
 class Fault(ProfileModel):
     """A fault, as a table of a scenario file: `[[faults]]`, or in words, as `gps off at 8s for 5s`.
 
-    Raises:
-        ValueError: The words, or the fields together, describe no fault (as pydantic has it).
+    Raises ValueError if the words, or the fields together, describe no fault (as pydantic has it).
     """
 
     part: Part = Field(description="what fails")
@@ -27,10 +26,9 @@ class Fault(ProfileModel):
     value: tuple[float, ...] = Field(
         default=(), description="how much, in the unit of the kind: one number, or three"
     )
-    phase: Phase | None = Field(
-        default=None,
-        description="phase of the flight that sets it off when it begins for the first time; by"
-        " default the start of the episode",
+    phase: Phase | None = optional(
+        "phase of the flight that sets it off when it begins for the first time; by"
+        " default the start of the episode"
     )
     at_s: float = quantity(
         "simulated time from the start of the episode, or of the phase, until it begins",
@@ -108,3 +106,34 @@ class Fault(ProfileModel):
 def link_fails(faults: Iterable[Fault]) -> bool:
     """Return whether any of these is a fault of the link between companion and firmware."""
     return any(fault.part in LINKS for fault in faults)
+
+
+# --- faults that the batch twin can fly; its flights begin where the policy takes over
+
+TWIN = "gym"
+"""The batch twin's rung of the fidelity ladder."""
+
+
+def check_twin(faults: Sequence[Fault], *, pipelined: bool = False) -> None:
+    """Raise FieldError for a fault that the twin cannot fly, with decisions `pipelined` or not."""
+    for fault in faults:
+        levels = fault.about.levels
+        if TWIN not in levels:
+            raise FieldError("faults", str(fault), f"at level {' or '.join(levels)}")
+        if not _in_flight(fault):
+            raise FieldError("faults", str(fault), "at offboard, or offboard+TIME, at level gym")
+        if pipelined and fault.kind == "delay":
+            accepted = "with decisions sequential, or at level lockstep or sitl"
+            raise FieldError("faults", str(fault), accepted)
+    late = [fault for fault in faults if (fault.part, fault.kind) == ("camera", "delay")]
+    if len(late) > 1:
+        raise FieldError("faults", str(late[1]), "one delay of the camera at level gym")
+
+
+def _in_flight(fault: Fault) -> bool:
+    """Return whether it begins in the flight, or has acted since before it.
+
+    What ends before the policy takes over was never there. Neither was the picture of the ground.
+    """
+    from_the_start = fault.phase is None and not fault.at_s and fault.for_s is None
+    return fault.phase == "offboard" or (from_the_start and fault.kind != "stuck")

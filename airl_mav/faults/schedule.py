@@ -13,14 +13,10 @@ FOREVER_US = 1 << 62
 
 
 def window_us(fault: Fault, entered_us: Mapping[str, int]) -> tuple[int, int] | None:
-    """Return from when to when a fault acts [µs since the start of the episode].
+    """Return begin and end, excluded, of a fault [µs since the start of the episode].
 
-    Args:
-        fault: The fault.
-        entered_us: When each phase of the flight began for the first time [µs since the start].
-
-    Returns:
-        Begin, included, and end, excluded; None: the phase that sets it off has not begun.
+    `entered_us` is when each phase of the flight began for the first time; None: the phase of the
+    fault has not begun.
     """
     origin_us = 0 if fault.phase is None else entered_us.get(fault.phase)
     if origin_us is None:
@@ -36,11 +32,7 @@ def window_us(fault: Fault, entered_us: Mapping[str, int]) -> tuple[int, int] | 
 def active(
     faults: Sequence[Fault], time_us: int, entered_us: Mapping[str, int]
 ) -> dict[int, tuple[int, int]]:
-    """Return the faults that act at a time [µs since the start of the episode].
-
-    Returns:
-        From when to when each of them acts, by its index; see `window_us`.
-    """
+    """Return begin and end of the faults that act at a time, by index; see `window_us`."""
     windows = ((i, window_us(fault, entered_us)) for i, fault in enumerate(faults))
     return {i: at for i, at in windows if at is not None and at[0] <= time_us < at[1]}
 

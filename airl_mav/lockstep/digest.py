@@ -14,11 +14,11 @@ from airl_mav.policy.actions import AnyAction, Policy
 from airl_mav.policy.observation import Observation
 
 LANES = ("trajectory", "setpoints", "observations", "telemetry", "commands")
-"""What is fingerprinted, each by itself, so that a difference shows where it began:
+"""Parts of a flight with a digest each. The first part that differs shows where a difference began.
 
-trajectory: every tick's true state; setpoints: what the autopilot flew, and when it took effect;
-observations: what the policy saw; telemetry: the bytes of all streams to the companion; commands:
-the frames that reached the flight controller, and when.
+trajectory: true state of every tick. setpoints: those flown, with their times. observations: inputs
+of the policy. telemetry: bytes of all streams to the companion. commands: frames that the flight
+controller received, with their times.
 """
 
 SEEN = "observations"

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from airl_mav.core.clock import SimClock, WallClock
 from airl_mav.core.constants import US_PER_MS, US_PER_S
-from airl_mav.core.signing_key import StoredSigning
+from airl_mav.core.signing import StoredSigning
 from airl_mav.flight.judge import Referee, Task, Verdict
 from airl_mav.lockstep.camera import TokenCamera
 from airl_mav.lockstep.conductor import Conductor

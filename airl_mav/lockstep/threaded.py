@@ -19,7 +19,7 @@ from airl_mav.lockstep.frames import newest, newest_heartbeat
 from airl_mav.lockstep.turns import Handle, LockstepError, Turn
 from companion.conducted import Abandoned, Poll
 from companion.mavsdk_link import MavsdkLink
-from firmware_sim.mavlink.codec import Encoder, dialect
+from firmware_sim.mavlink.codec import Encoder, dialect, layout
 
 FIRST_BARRIER = 0x8000_0000
 """Sequence number of the first barrier's PING: those of the autopilot's own stream stay below."""
@@ -37,6 +37,7 @@ LONGEST_ANSWER_US = 10 * US_PER_S
 """Longest time that the answer to a command may take [µs of simulated time]."""
 
 _PING: int = dialect.MAVLINK_MSG_ID_PING
+_PING_LAYOUT = layout("PING")
 
 
 class ThreadPartner:
@@ -118,7 +119,7 @@ class ThreadPartner:
         """Wait until MAVSDK has taken in and sent out everything so far."""
         number, self._fed = self._barriers, False
         self._barriers += 1
-        ping = self._encoder.pack(dialect.MAVLink_ping_message(0, number, 0, 0))
+        ping = self._encoder.frame(_PING_LAYOUT, _PING_LAYOUT.payload((0, number, 0, 0)))
         wanted = number.to_bytes(4, "little")
         waited = Patience()
         again_s = 0.0
@@ -128,13 +129,15 @@ class ThreadPartner:
                 # then. A second answer is passed over.
                 self._feed(ping)
                 again_s = so_far_s + PING_AGAIN_S
-            with suppress(Empty):
+            try:
                 item = self._inbox.get(timeout=PING_AGAIN_S)
-                if not isinstance(item, bytes):
-                    raise LockstepError("the companion gave back a turn that it did not have")
-                if _is_ping(item) and item[18:22] == wanted:
-                    return
-                handle(item)
+            except Empty:
+                continue
+            if not isinstance(item, bytes):
+                raise LockstepError("the companion gave back a turn that it did not have")
+            if _is_ping(item) and item[18:22] == wanted:
+                return
+            handle(item)
         raise LockstepError(f"MAVSDK hangs: no answer to a PING in {PATIENCE_S} s")
 
     def _work(self, handle: Handle) -> Turn | threading.Event:

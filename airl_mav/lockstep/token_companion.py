@@ -67,8 +67,8 @@ def fly_in_lockstep(
         closing(MavsdkLink(url, clock, abandon, heard=lambda: True)) as link,
     ):
         waiting()
-        # On MAVSDK's own time-out: who answers nothing, as one that refuses what is not signed with
-        # its key, is given up soon, and an order to end is heard. To ask again changes nothing.
+        # MAVSDK's own time-out ends the wait for a vehicle that rejects unsigned messages. It also
+        # lets an order to end take effect. A retry is harmless.
         link.connect(asked.connect_timeout, stop)
         link.set_timeout(ANSWER_TIMEOUT_S)
         camera = TokenFrameSource(frames, turns, clock)

@@ -10,8 +10,8 @@ from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 
 SETTLE_EVERY = 5
-"""Real firmware is waited for before a turn, and in between every so many ticks, and what it has
-sent is taken then: 20 ms is how old its telemetry, and what its modules know, may get."""
+"""Ticks between two waits for real firmware. A turn begins with a wait, too. Telemetry is read
+then: it is at most 20 ms old."""
 
 _HEADER = 10
 _COMMANDS = {

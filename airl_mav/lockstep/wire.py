@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from airl_mav.core.clock import Clock, WallClock
 from airl_mav.core.constants import US_PER_S
-from airl_mav.core.signing_key import StoredSigning
+from airl_mav.core.signing import StoredSigning
 from airl_mav.lockstep.frames import datagrams, split
 from firmware_sim.mavlink.codec import Decoder, WireMessage, is_signed
 from firmware_sim.mavlink.endpoint import Endpoint, Peer, UdpEndpoint

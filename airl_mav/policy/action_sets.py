@@ -124,21 +124,16 @@ def command_numbers(spec: ActionSpec) -> int:
 def commands(spec: ActionSpec, actions: NDArray[Any]) -> NDArray[np.float64]:
     """Return the commands of n actions.
 
-    Args:
-        spec: The action set.
-        actions: (n,) whole numbers, from 0 on, of a discrete set; (n, 2) numbers of a continuous
-            one: of those shipped, forward and right speed, each -1..1 of the fastest; anything
-            beyond is cut off. Of a set of three dimensions (n, 3): also the downward speed, of
-            the fastest climb (`actions.fastest_climb`). Of `body-rates` (n, 4): roll, pitch and
-            yaw rate, each -1..1 of the greatest, and thrust, -1 for none to 1 for all.
+    Discrete actions are (n,) whole numbers from 0 on. Continuous ones are (n, 2): forward and right
+    speed, each -1..1 of the fastest, clipped. Sets of three dimensions are (n, 3). Their third
+    number is the downward speed, of the fastest climb (`actions.fastest_climb`). `body-rates` is
+    (n, 4): roll, pitch and yaw rate, each -1..1 of the maximum, and thrust, -1 for none to 1 for
+    all.
 
-    Returns:
-        (n, 3) forward and right [m/s] in the heading frame, yaw rate [rad/s], clockwise positive;
-        of a set of three dimensions (n, 4): behind them the downward speed [m/s]. Of `body-rates`
-        (n, 4): as `actions.BodyRates`.
-
-    Raises:
-        UsageError: A set of the user's gives anything else.
+    The commands are (n, 3): forward and right [m/s] in the heading frame, and yaw rate [rad/s],
+    clockwise positive. Sets of three dimensions have the downward speed [m/s] behind them.
+    `body-rates` has (n, 4), as `actions.BodyRates`. Raises UsageError if a set of the user's
+    returns anything else.
     """
     if spec.set not in SHIPPED:
         return _checked(spec, actions)

@@ -53,17 +53,11 @@ class Attitude(NamedTuple):
         yaw_rad: float,
         hover_thrust: float = 0.5,
     ) -> Attitude:
-        """Return what accelerates a vehicle so: for policies that command accelerations.
+        """Return the attitude and thrust of an acceleration, for policies that command those.
 
-        Thrust alone makes the specific force a - g, as in PX4's ControlMath::bodyzToAttitude; drag
-        is left to the policy. A tilt is not limited.
-
-        Args:
-            forward_m_s2: Level, along the heading that is commanded [m/s²].
-            right_m_s2: Level, to the right of it [m/s²].
-            down_m_s2: Downward [m/s²]; 0 holds the vertical speed.
-            yaw_rad: That heading, 0 = north, positive to the east.
-            hover_thrust: MPC_THR_HOVER of the vehicle.
+        Thrust alone makes the specific force a - g, as in PX4's ControlMath::bodyzToAttitude. Drag
+        is left to the policy. A tilt is not limited. Forward and right are level, along the
+        commanded heading (0 = north, positive to the east); 0 down holds the vertical speed.
         """
         up_m_s2 = GRAVITY_M_S2 - down_m_s2
         force_m_s2 = math.hypot(forward_m_s2, right_m_s2, up_m_s2)
@@ -114,12 +108,7 @@ def fastest_climb(speed_m_s: float) -> float:
 
 
 def vertical_speed(altitude_m: float, down_m: float) -> float:
-    """Return the downward speed [m/s] that holds an altitude.
-
-    Args:
-        altitude_m: Height above the start to hold [m].
-        down_m: Present position, down of the start [m].
-    """
+    """Return the downward speed [m/s] that holds a height above the start [m], from a position."""
     return float(vertical_speeds(altitude_m, np.array(down_m)))
 
 
@@ -143,10 +132,7 @@ class Policy(Protocol):
 
 
 def command_kind(policy: object) -> CommandKind:
-    """Return what a policy, or the class of one, commands.
-
-    Raises FieldError when it says anything else.
-    """
+    """Return what a policy, or its class, commands. Raises FieldError if it says anything else."""
     kind = getattr(policy, "commands", "velocity")
     for known in KINDS:
         if kind == known:
@@ -180,14 +166,9 @@ class RigBound(CameraBound, Protocol):
 def flyable(action: AnyAction, kind: CommandKind, speed_m_s: float) -> AnyAction:
     """Return an action as it may be sent: a velocity `limited`, a thrust within 0..1.
 
-    Args:
-        action: What a policy has returned.
-        kind: What it commands.
-        speed_m_s: Limit of velocities [m/s].
-
     Raises:
         TypeError: It is of another kind.
-        ValueError: An attitude, a body rate or a thrust is no number: nothing is safe to put in its
+        ValueError: An attitude, a body rate or a thrust is no number. Nothing is safe to put in its
             place.
     """
     wanted = KINDS[kind]

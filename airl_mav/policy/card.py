@@ -16,7 +16,7 @@ from pydantic import Field, Strict, model_validator
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.constants import Level
 from airl_mav.core.errors import UsageError
-from airl_mav.core.fields import ProfileModel, quantity, validated
+from airl_mav.core.fields import ProfileModel, optional, quantity, switch, validated
 from airl_mav.core.files import read_json
 from airl_mav.policy.action_sets import CONTINUOUS, ActionSpec
 from airl_mav.policy.action_sets import SHIPPED as SHIPPED_ACTION_SETS
@@ -45,16 +45,16 @@ Count = Annotated[int, Strict()]
 class Training(ProfileModel):
     """What made a policy. A policy from elsewhere may not know."""
 
-    arena: str | None = Field(default=None, description="arena profile it was trained in")
-    first_arena_seed: Count | None = Field(default=None, description="first seed of the arenas")
-    last_arena_seed: Count | None = Field(default=None, description="last seed of the arenas")
-    seed: Count | None = Field(default=None, description="seed of the training")
+    arena: str | None = optional("arena profile it was trained in")
+    first_arena_seed: Count | None = optional("first seed of the arenas")
+    last_arena_seed: Count | None = optional("last seed of the arenas")
+    seed: Count | None = optional("seed of the training")
     env_steps: int | None = quantity("decisions it was trained on", "1", ge=0, default=None)
-    config_file: str | None = Field(default=None, description="name of the training's settings")
+    config_file: str | None = optional("name of the training's settings")
     config: dict[str, Any] = Field(default_factory=dict, description="the settings in full")
-    command: str | None = Field(default=None, description="command that made the policy")
+    command: str | None = optional("command that made the policy")
     versions: dict[str, str] = Field(default_factory=dict, description="packages by name")
-    date_utc: str | None = Field(default=None, description="when it was exported, ISO 8601")
+    date_utc: str | None = optional("when it was exported, ISO 8601")
 
 
 class Measured(Protocol):
@@ -110,9 +110,8 @@ class MeasuredResult(ProfileModel):
 
     arena: str = Field(description="arena profile")
     level: Level = Field(description="rung of the fidelity ladder")
-    latency: str | None = Field(
-        default=None,
-        description="source of t2 as --latency takes it; none: as fast as a desktop computer",
+    latency: str | None = optional(
+        "source of t2 as --latency takes it; none: as fast as a desktop computer"
     )
     episodes: int = quantity("episodes flown", "1", ge=1)
     seed: Count = Field(description="seed of the first episode; each has the next")
@@ -126,10 +125,8 @@ class MeasuredResult(ProfileModel):
     flight_time_s: float | None = quantity("flight time", "s", ge=0, default=None)
     distance_m: float | None = quantity("distance flown", "m", ge=0, default=None)
     energy_j: float | None = quantity("energy drawn", "J", ge=0, default=None)
-    flown_utc: str | None = Field(default=None, description="when it was flown, ISO 8601")
-    behaviour: str | None = Field(
-        default=None, description="fingerprint of the flight behaviour that it was flown with"
-    )
+    flown_utc: str | None = optional("when it was flown, ISO 8601")
+    behaviour: str | None = optional("fingerprint of the flight behaviour that it was flown with")
 
     @classmethod
     def of(cls, quality: MeasuredQuality, **conditions: Any) -> MeasuredResult:
@@ -179,9 +176,7 @@ class PolicyFacts(ProfileModel):
     decisions: DecisionTiming = Field(
         default="sequential", description="when a decision begins; see airl_mav.scenario.model"
     )
-    compensate: bool = Field(
-        default=False, description="it wants its decision latency compensated, as in training"
-    )
+    compensate: bool = switch("it wants its decision latency compensated, as in training")
     algorithm: str = Field(default="", description="what trained it")
     epsilon: float = quantity("share of random actions in flight", "1", ge=0, le=1, default=0.0)
     training: Training = Field(default_factory=Training)
@@ -223,9 +218,7 @@ class PolicyCard(PolicyFacts):
     """All of the card."""
 
     sha256: Digest = Field(description=f"SHA-256 digest of {ONNX_FILE}")
-    torch_sha256: Digest | None = Field(
-        default=None, description=f"SHA-256 digest of {TORCH_FILE}, if there is one"
-    )
+    torch_sha256: Digest | None = optional(f"SHA-256 digest of {TORCH_FILE}, if there is one")
     state: dict[str, tuple[Count, ...]] = Field(
         default_factory=dict,
         description="what a network with a memory remembers from decision to decision: shapes by "
@@ -234,8 +227,8 @@ class PolicyCard(PolicyFacts):
     network: str = Field(description="its layers, as text")
     parameters: int = quantity("weights and biases", "1", ge=1)
     macs: int = quantity("multiply-accumulates of one inference", "1", ge=1)
-    quantisation: Quantisation | None = Field(
-        default=None, description="of a network in 8-bit integers; none: one in floats"
+    quantisation: Quantisation | None = optional(
+        "of a network in 8-bit integers; none: one in floats"
     )
 
 
@@ -245,11 +238,7 @@ def digest(data: bytes) -> str:
 
 
 def read_card(folder: Path) -> PolicyCard:
-    """Read the card of a policy without a look at the policy itself.
-
-    Raises:
-        UsageError: There is none, or it has a field that is missing, unknown or out of range.
-    """
+    """Read the card of a policy, not the policy itself. Raises UsageError."""
     path = folder / CARD_FILE
     data = read_json(path, SCHEMA, "policy")
     del data["schema"]
@@ -273,9 +262,8 @@ def read_torch_program(folder: Path, card: PolicyCard) -> bytes:
 def load_card(folder: Path, *, trust: bool = False) -> PolicyCard:
     """Read the card of a policy and hold the policy against it.
 
-    Raises:
-        UsageError: See `read_card`; also when the file has another digest, or other inputs and
-            outputs than the card says, or the card names code and there is no trust.
+    Raises UsageError: see `read_card`; also when the file has another digest, or other inputs and
+    outputs than the card says, or the card names code and there is no trust.
     """
     card = read_card(folder)
     open_model(folder, card, trust=trust)

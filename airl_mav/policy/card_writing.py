@@ -1,15 +1,21 @@
-"""Writing policy cards, and their pages for people."""
+"""Writing policy cards, their pages for people, and copies of policies under another card."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
+from airl_mav.core.errors import UsageError
+from airl_mav.core.fields import validated
 from airl_mav.core.files import replace_file, write_json
 from airl_mav.policy.card import (
     CARD_FILE,
+    ONNX_FILE,
     SCHEMA,
+    TORCH_FILE,
     MeasuredResult,
     PolicyCard,
+    load_card,
     read_card,
     read_model,
     read_torch_program,
@@ -18,12 +24,10 @@ from airl_mav.policy.model_card import MARK, MODEL_CARD_FILE, model_card
 
 
 def write_card(folder: Path, card: PolicyCard) -> None:
-    """Write the card beside the policy that it is for; the old card stays until the new is whole.
+    """Write the card beside the policy that it is for. The old card stays until the new is whole.
 
     Its page for people, `README.md`, is written after it, unless somebody else's has that name.
-
-    Raises:
-        UsageError: The folder holds another policy, or none.
+    Raises UsageError if the folder holds another policy, or none.
     """
     read_model(folder, card)
     if card.torch_sha256 is not None:
@@ -41,11 +45,7 @@ def write_model_card(folder: Path, card: PolicyCard) -> None:
 
 
 def add_result(folder: Path, result: MeasuredResult) -> PolicyCard:
-    """Write a result onto a card, in place of an earlier one of the same arena, level and latency.
-
-    Raises:
-        UsageError: See `read_card`.
-    """
+    """Write a result onto a card, in place of that of the same arena, level and latency."""
     card = read_card(folder)
     others = [each for each in card.results if _conditions(each) != _conditions(result)]
     results = tuple(sorted([*others, result], key=_conditions))
@@ -56,3 +56,32 @@ def add_result(folder: Path, result: MeasuredResult) -> PolicyCard:
 
 def _conditions(result: MeasuredResult) -> tuple[str, str, str]:
     return result.level, result.arena, result.latency or ""
+
+
+def copy_policy(
+    source: Path, out: Path, changes: dict[str, Any], *, trust: bool = False
+) -> PolicyCard:
+    """Write a policy's network to another folder, its card with changes, and return the card.
+
+    Measurements of the source do not apply. The card has no results until it is evaluated. `trust`
+    permits the source's maker to run code on this machine. Raises UsageError if the policy cannot
+    be used, a change is out of range, or `out` is the source or cannot be written.
+    """
+    card = load_card(source, trust=trust)
+    if out.resolve() == source.resolve():
+        raise UsageError(f"{out}: accepted: another folder than the policy's own")
+    if out.exists() and not out.is_dir():
+        raise UsageError(f"{out}: not a folder")
+    plain = card.model_dump(mode="json") | {"results": ()} | changes
+    copied = validated(PolicyCard, plain)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        replace_file(out / ONNX_FILE, read_model(source, card))
+        if card.torch_sha256 is not None:
+            replace_file(out / TORCH_FILE, read_torch_program(source, card))
+        write_card(out, copied)
+        if card.torch_sha256 is None:
+            (out / TORCH_FILE).unlink(missing_ok=True)
+    except OSError as error:
+        raise UsageError(f"{out}: {error.strerror}") from None
+    return copied

@@ -68,7 +68,7 @@ NUMPY = Shrink(shrink_depth, shrink_colour, NUMPY_SCANNING)
 
 
 def nearest_returns(depth_mm: NDArray[np.uint16], rows: int, columns: int) -> NDArray[np.uint16]:
-    """Shrink Z16 images (n, h, w) to (n, rows, columns): the nearest return of each block wins.
+    """Shrink Z16 images (n, h, w) to (n, rows, columns). The nearest return of each block wins.
 
     Values are one less than in the images, so that "no return" (0) wraps round to the farthest.
     """

@@ -3,10 +3,10 @@
 `body` is the default: the camera's image, and goal and velocity in the heading frame. `paper` is
 Air Learning's own input as its code has it: a 154 x 256 image whose top rows draw the bearing of
 the goal, and vectors in the world frame. `scan` is `body` with a level scan, as a planar lidar's,
-in place of the depth image; earlier frames are carried to where the vehicle is now. All are Dicts
-of the image, `velocity` and `goal`; the image's key is what the camera gives: `depth`, `rgb` or
-`grey`. Images of further cameras follow, under KIND_NAME. Any other layout is the user's own
-(`own_layouts`).
+in place of the depth image. Earlier frames are carried to where the vehicle is now. All are Dicts
+of the image, `velocity` and `goal`. The image's key is what the camera gives: `depth`, `rgb` or
+`grey`. Images of further cameras follow, under KIND_NAME. Any other layout is a class of the
+user's, made without arguments, whose objects are a `Layout`.
 
 The function that trains is the function that flies: `encode_layout` takes n vehicles at a time,
 and the companion is n = 1.
@@ -16,12 +16,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from functools import cache
+from typing import Any, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.core.errors import UsageError
+from airl_mav.core import plugins
+from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.frames import down_in_body, heading_to_ned
 from airl_mav.policy.images import NUMPY, Bytes, Shrink, body_bytes, paper_bytes
 from airl_mav.policy.observation import Observation
@@ -35,7 +37,6 @@ from airl_mav.policy.observation_spec import (
     SeenCamera,
     Told,
 )
-from airl_mav.policy.own_layouts import own_arrays, own_boxes
 from airl_mav.policy.scans import scan_bytes, scans_of
 from airl_mav.profiles.camera_kind import CHANNELS, KINDS
 
@@ -68,11 +69,7 @@ STRIP_HALF_WIDTH = 1
 
 
 def boxes(spec: ObservationSpec) -> dict[str, Box]:
-    """Return the arrays of a layout, by key.
-
-    Raises:
-        UsageError: A layout of the user's has others than a network can take.
-    """
+    """Return the arrays of a layout, by key. Raises UsageError if a network cannot take them."""
     if spec.layout not in SHIPPED:
         return own_boxes(spec)
     found = {
@@ -98,10 +95,7 @@ def further_boxes(spec: ObservationSpec) -> dict[str, Box]:
 def encode_layout(spec: ObservationSpec, seen: Observation, shrink: Shrink = NUMPY) -> Encoded:
     """Return the arrays of a layout for n vehicles.
 
-    Args:
-        spec: The layout; its camera must fit (`camera_mismatch`).
-        seen: Of n vehicles: every array has a leading axis (n,).
-        shrink: What makes the network's images of the camera's; numpy by default.
+    Its camera must fit (`camera_mismatch`). Every array of `seen` has a leading axis (n,).
 
     Returns:
         The image uint8, the newest frame first: `depth` (n, frames, height, width), "no return"
@@ -123,7 +117,7 @@ def encode_layout(spec: ObservationSpec, seen: Observation, shrink: Shrink = NUM
 
     Raises:
         ValueError: The network is told of decisions of which nobody keeps account.
-        UsageError: A layout of the user's gives anything else than it says; or the network is told
+        UsageError: A layout of the user's gives anything else than it says. Or the network is told
             how high the goal is, and it has no height; or a further camera shows nothing.
     """
     if spec.layout not in SHIPPED:
@@ -242,15 +236,7 @@ def _part(name: Told, seen: Observation) -> NDArray[np.float64]:
 
 
 def newest_frame(spec: ObservationSpec, seen: Mapping[str, NDArray[Any]]) -> NDArray[np.uint8]:
-    """Return a copy of the newest frame that one vehicle's network sees, as a picture.
-
-    Args:
-        spec: The layout.
-        seen: Its arrays, without a leading axis.
-
-    Returns:
-        (h, w); of rgb (h, w, 3). A scan is as high as the camera's image would be.
-    """
+    """Return a copy of one vehicle's newest frame, as a picture (h, w) or (h, w, 3)."""
     channels = seen[spec.kind][: CHANNELS[spec.kind]]
     if spec.layout == "scan":
         scan = channels[:, :1, spec.seam : spec.seam + spec.width_px]
@@ -267,7 +253,7 @@ def ablated(encoded: Mapping[str, NDArray[Any]], key: str) -> Encoded:
 def _bearing_strip(spec: ObservationSpec, seen: Observation) -> NDArray[np.uint8]:
     """Return Air Learning's strip (n, 10, width): white, a black bar at the goal's bearing.
 
-    Bearings of -180..180 deg run from the left to the right edge; the last row is black.
+    Bearings of -180..180 deg run from the left to the right edge. The last row is black.
     """
     n, width = len(seen.goal), spec.width_px
     bearing = np.arctan2(seen.goal[:, 1], seen.goal[:, 0])
@@ -278,3 +264,69 @@ def _bearing_strip(spec: ObservationSpec, seen: Observation) -> NDArray[np.uint8
     for offset in range(-STRIP_HALF_WIDTH, STRIP_HALF_WIDTH + 1):
         strip[np.arange(n), :, column + offset] = 0
     return strip
+
+
+class Layout(Protocol):
+    """A layout of the user's."""
+
+    def boxes(self, spec: ObservationSpec) -> Mapping[str, Box]:
+        """Return its arrays by key: `spec.kind` uint8 (channels, height, width), others float32.
+
+        The same of the keys of further cameras (`spec.further_keys`).
+        """
+        ...
+
+    def encode(self, spec: ObservationSpec, seen: Observation) -> Mapping[str, NDArray[Any]]:
+        """Return those arrays for n vehicles, as `encode_layout` does: of each from its own row."""
+        ...
+
+
+def own_boxes(spec: ObservationSpec) -> dict[str, Box]:
+    """Return the arrays of a layout of the user's by key, sorted, if a network can take them."""
+    found = {key: Box(*box) for key, box in sorted(_own(spec.layout).boxes(spec).items())}
+    images = {spec.kind, *spec.further_keys.values()}
+    wrong = [
+        f"{key} {np.dtype(box.dtype)} {box.shape}"
+        for key, box in found.items()
+        if len(box.shape) != (3 if key in images else 1)
+        or np.dtype(box.dtype) != np.dtype(np.uint8 if key in images else np.float32)
+    ]
+    if wrong or not images <= found.keys():
+        problem = f"its arrays are {', '.join(wrong) or ', '.join(found)}"
+        named = ", ".join((spec.kind, *sorted(spec.further_keys.values())))
+        wanted = f"{named} uint8 (channels, height, width), all others float32 (k,)"
+        raise FieldError(
+            plugins.LAYOUTS.field, spec.layout, problem=f"{problem}; accepted: {wanted}"
+        )
+    return found
+
+
+def own_arrays(spec: ObservationSpec, seen: Observation) -> Encoded:
+    """Return what a layout of the user's makes of an observation, if it is what it says."""
+    found, wanted = _own(spec.layout).encode(spec, seen), own_boxes(spec)
+    encoded = {key: np.asarray(found[key]) for key in wanted if key in found}
+    n = len(seen.goal)
+    for key, box in wanted.items():
+        array = encoded.get(key)
+        if array is None or array.shape != (n, *box.shape) or array.dtype != box.dtype:
+            given = "nothing" if array is None else f"{array.dtype} {array.shape}"
+            raise UsageError(
+                f"layout {spec.layout!r}: gives {given} for {key!r}; accepted:"
+                f" {np.dtype(box.dtype)} {(n, *box.shape)}"
+            )
+    return encoded
+
+
+@cache
+def _own(name: str) -> Layout:
+    """Return a layout of the user's. Raises FieldError."""
+    door = plugins.LAYOUTS
+    methods = ("boxes", "encode")
+    found = plugins.load_part(
+        door, name, lambda made: all(callable(getattr(made, each, None)) for each in methods)
+    )
+    try:
+        return cast("Layout", found() if isinstance(found, type) else found)
+    except Exception as error:
+        problem = f"cannot be made without arguments: {type(error).__name__}: {error}"
+        raise FieldError(door.field, name, problem=problem) from error

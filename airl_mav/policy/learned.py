@@ -40,7 +40,7 @@ from airl_mav.profiles.loading import profiles_dir
 class LearnedPolicy:
     """A network with its card. Implements `actions.Policy`.
 
-    A network with a memory remembers one flight, or n side by side: an object flies them from
+    A network with a memory remembers one flight, or n side by side. An object flies them from
     their first decision to their last, and `with_generator` gives the one for the next flight.
     """
 
@@ -52,16 +52,10 @@ class LearnedPolicy:
         rng: np.random.Generator | None = None,
         ablate: str | None = None,
     ) -> None:
-        """Put a policy together.
+        """Put a policy together; a card with an epsilon needs an `rng`.
 
-        Args:
-            card: What the network takes and gives.
-            runtime: The network.
-            rng: Source of random actions; a card with an epsilon needs one.
-            ablate: Input that is made zero, as the paper's sensor ablation does; None: none.
-
-        Raises:
-            UsageError: The layout has no such input.
+        `ablate` names an input that is made zero, as the paper's sensor ablation does. Raises
+        UsageError if the layout has no such input.
         """
         if ablate is not None and ablate not in boxes(card.observation):
             known = ", ".join(boxes(card.observation))
@@ -120,25 +114,16 @@ class LearnedPolicy:
     ) -> NDArray[Any]:
         """Return the actions of n vehicles, as `action_sets.commands` takes them; see `decide`.
 
-        Args:
-            encoded: The arrays of the card's layout, each with n rows.
-            rng: Source of random actions in this call; None: the policy's own.
-
-        Raises:
-            ValueError: The network gives no number, or it remembers another number of flights.
+        `encoded` are the arrays of the card's layout, each with n rows. Without `rng` the policy's
+        own is used. Raises ValueError as `outputs`, and if an output is not a number.
         """
         return decide(self.card.actions, self.outputs(encoded), self.card.epsilon, rng or self._rng)
 
     def outputs(self, encoded: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
-        """Return what the network says (n, k): a score for each discrete action, or the action.
+        """Return a score (n, k) for each discrete action, or the action, of n flights.
 
-        A network with a memory remembers the call as a decision.
-
-        Args:
-            encoded: The arrays of the card's layout, each with n rows.
-
-        Raises:
-            ValueError: The network remembers another number of flights.
+        A network with a memory remembers the call as a decision. ValueError: it remembers other
+        flights.
         """
         if self._ablate is not None:
             encoded = ablated(encoded, self._ablate)
@@ -165,17 +150,9 @@ def decide(
 ) -> NDArray[Any]:
     """Turn a network's outputs (n, k) into actions: the best score wins, or chance.
 
-    Args:
-        actions: The action set.
-        outputs: A score for each discrete action, or the continuous action itself.
-        epsilon: Share of random actions; discrete sets only.
-        rng: Source of random actions; needed with an epsilon.
-
-    Returns:
-        (n,) int64 of a discrete set, (n, 2) float32 of the continuous one.
-
-    Raises:
-        ValueError: An output is not a number, or chance has no source.
+    `epsilon` is the share of random actions of a discrete set. Returns (n,) int64 of a discrete
+    set, (n, 2) float32 of the continuous one. Raises ValueError if an output is not a number, or
+    chance has no `rng`.
     """
     if np.isnan(outputs).any():
         raise ValueError("the network's output is not a number")
@@ -205,11 +182,8 @@ def load_learned(
 
     The card is read where none is given. `runtime`, `threads` and `trust` are those of
     `open_network`, `rng` and `ablate` those of `LearnedPolicy`. An inference is made at once, so
-    that the first decision in the air is no slower than the others.
-
-    Raises:
-        UsageError: Card and policy do not fit each other, or the runtime is not installed or not
-            trusted.
+    that the first decision in the air is no slower than the others. Raises UsageError: card and
+    policy do not fit each other, or the runtime is not installed or not trusted.
     """
     card = card or read_card(folder)
     check_trust(folder, card, trust=trust)
@@ -229,19 +203,12 @@ def load_learned(
 def open_network(
     folder: Path, card: PolicyCard, runtime: RuntimeName, threads: int, *, trust: bool = False
 ) -> RecurrentRuntime:
-    """Return the network of a card, ready for its first inference.
+    """Return the network of a card, ready for its first inference; `torch` takes `policy.pt2`.
 
-    Args:
-        folder: The policy's folder.
-        card: Its card.
-        runtime: What runs the network; `torch` takes the folder's `policy.pt2`.
-        threads: Threads of one inference.
-        trust: Whether the folder's maker may run code on this machine. `torch.export.load` falls
-            back to unpickling, which runs whatever the file says. An ONNX model is data, and the
-            policies that come with this package are trusted. A card may name code, too.
-
-    Raises:
-        UsageError: As of `load_learned`.
+    `trust` permits the folder's maker to run code on this machine: `torch.export.load` falls back
+    to unpickling, which runs whatever the file says. An ONNX model is data, and the policies that
+    come with this package are trusted. A card may name code, too. Raises UsageError as
+    `load_learned`.
     """
     if runtime == "onnx":
         return open_model(folder, card, threads, trust=trust)

@@ -79,7 +79,6 @@ class View:
     """What a further camera shows, of one vehicle or with a leading axis of n."""
 
     image: NDArray[Any]
-    """As `Observation.image`."""
     intrinsics: Intrinsics
     earlier: tuple[NDArray[Any], ...] = ()
     """Its images of the decisions before, as far as they are kept, the newest first."""
@@ -175,12 +174,7 @@ def encode(frame: Frame, state: Kinematics, goal: Goal) -> Observation:
 
 
 def views_of(frame: Frame, earlier: Sequence[Mapping[str, NDArray[Any]]] = ()) -> dict[str, View]:
-    """Return what the further cameras of a frame show.
-
-    Args:
-        frame: The frame.
-        earlier: The images of the decisions before by camera, the newest first.
-    """
+    """Return the further cameras' views of a frame; `earlier` images are the newest first."""
     return {
         name: View(each.image, each.intrinsics, tuple(then[name] for then in earlier))
         for name, each in frame.further.items()
@@ -198,14 +192,8 @@ def observe(
 ) -> Observation:
     """Return the observation of one vehicle, or of n.
 
-    Args:
-        image: As `Observation.image`.
-        intrinsics: The camera.
-        state: Telemetry.
-        goal: (..., 2) north, east [m], or (..., 3): down as well, where it has a height.
-        in_flight: What is known of the decisions; None: nothing is.
-        earlier: What the decisions before saw, and the states they saw it in, the newest first.
-        further: What further cameras show, by name; None: there are none.
+    `goal` is (..., 2) north, east [m], or (..., 3) with down. `earlier` are the images and states
+    of the decisions before, the newest first. `further` are the views of further cameras by name.
     """
     roll, pitch, yaw = quats_to_euler(state.quaternion)
     to_goal = np.zeros_like(state.position)

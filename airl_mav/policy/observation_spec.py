@@ -18,11 +18,15 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core import plugins
 from airl_mav.core.fields import ProfileModel, later_field, quantity
 from airl_mav.policy.scans import goes_round
-from airl_mav.profiles.camera import Coefficients
-from airl_mav.profiles.camera_kind import CHANNELS, CameraKind
+from airl_mav.profiles.camera import Coefficients, camera_named
+from airl_mav.profiles.camera_kind import (
+    CHANNELS,
+    CYLINDER_MOST_DEG,
+    CameraKind,
+    Projection,
+    check_fov,
+)
 from airl_mav.profiles.distortion import UNDISTORTED, check_distortion, distorted, undistorted
-from airl_mav.profiles.further_cameras import camera_named
-from airl_mav.profiles.projection import CYLINDER_MOST_DEG, Projection, check_fov
 
 SHIPPED = ("body", "paper", "scan")
 LayoutName = Annotated[str, plugins.part_name(plugins.LAYOUTS, SHIPPED)]
@@ -304,7 +308,7 @@ def camera_mismatch(spec: ObservationSpec | SeenCamera, camera: Intrinsics) -> s
 def _apart_deg(spec: ObservationSpec | SeenCamera, camera: Intrinsics) -> float:
     """Return how far apart two lenses see, at most, what they have in one place of the image.
 
-    Their fields of view are the same; this is between the middle of the image and its edge [deg].
+    Their fields of view are the same. This is between the middle of the image and its edge [deg].
     """
     if spec.distortion == camera.distortion:
         return 0.0

@@ -30,17 +30,13 @@ _DENSE = ("Gemm", "MatMul")
 def quantised(model: bytes, frames: Encoded) -> bytes:
     """Return a network whose convolutions and dense layers compute in 8-bit integers.
 
-    Inputs and outputs stay what they are. The last dense layer stays in floats: it is small, and
-    with it in integers scores that lie close together change places. The graph has a pair of
-    QuantizeLinear and DequantizeLinear around each tensor (QDQ), which ONNX Runtime fuses where
-    the processor has integer kernels.
+    Inputs and outputs stay what they are. The last dense layer stays in floats. It is small. With
+    integers, scores that lie close together change places. The graph has a pair of QuantizeLinear
+    and DequantizeLinear around each tensor (QDQ). ONNX Runtime fuses them where the processor has
+    integer kernels.
 
-    Args:
-        model: The bytes of an .onnx file that holds its weights.
-        frames: The arrays of the layout, with the rows that the ranges are found with.
-
-    Raises:
-        UsageError: onnx is not installed, or its tools cannot quantise the network.
+    `model` is an .onnx file with its weights. The ranges are found with the rows of `frames`.
+    Raises UsageError if onnx is not installed or cannot quantise the network.
     """
     try:
         import onnx
@@ -90,7 +86,7 @@ def quantised(model: bytes, frames: Encoded) -> bytes:
 def relative_error(found: NDArray[np.float32], wanted: NDArray[np.float32]) -> float:
     """Return the root mean square of the differences of outputs (n, k), in shares of their spread.
 
-    The spread is the standard deviation of all that is wanted; outputs that are all the same have
+    The spread is the standard deviation of all that is wanted. Outputs that are all the same have
     none, and any difference of theirs is infinitely large.
     """
     away = float(np.sqrt(np.mean((found - wanted) ** 2)))

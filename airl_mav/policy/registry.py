@@ -93,13 +93,9 @@ def policy_names() -> list[str]:
 def find_policy(name: str, *, trust: bool = False) -> PolicyInfo:
     """Return what is known of a policy: by name, by its folder's path, or by its Python class.
 
-    Args:
-        name: Of the policy.
-        trust: Whether the maker of its folder may run code on this machine.
-
-    Raises:
-        UsageError: There is no such policy (lists those that exist), its card does not fit it, or
-            names code without trust.
+    `trust` permits the maker of its folder to run code on this machine. Raises UsageError if there
+    is no such policy (lists those that exist), its card does not fit it, or names code without
+    trust.
     """
     if names_code(name):
         return PolicyInfo(name.rpartition(":")[2], _summary(name), program=name)
@@ -125,11 +121,9 @@ def load_policy(
     """Return a policy, ready to decide, by what is known of it, its name or its folder.
 
     `hold_s` is how long each of its actions will be held [s]. The keywords are those of
-    `learned.load_learned`; only a learned policy takes another runtime or an ablation.
-
-    Raises:
-        UsageError: There is no such policy (lists those that exist), its card does not fit it, or
-            it cannot be run as asked.
+    `learned.load_learned`; only a learned policy takes another runtime or an ablation. Raises
+    UsageError if there is no such policy (lists those that exist), its card does not fit it, or it
+    cannot be run as asked.
     """
     known = find_policy(policy, trust=trust) if isinstance(policy, str) else policy
     if known.folder is not None and known.card is not None:
@@ -157,11 +151,7 @@ def _shipped() -> list[str]:
 
 
 def _folder(name: str) -> Path | None:
-    """Return the folder of a policy; None for one that an installed package announces.
-
-    Raises:
-        UsageError: Neither.
-    """
+    """Return the folder of a policy; None for one of an installed package. Raises UsageError."""
     if name in _shipped():
         return profiles_dir() / "policies" / name
     path = Path(name)

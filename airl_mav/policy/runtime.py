@@ -83,17 +83,10 @@ class OnnxRuntime:
         threads: int = 1,
         state: Shapes | None = None,
     ) -> None:
-        """Open a network.
+        """Open the bytes of an .onnx file that holds its weights. Small networks need one thread.
 
-        Args:
-            model: The bytes of an .onnx file that holds its weights.
-            observation: What it must take.
-            actions: What it must give.
-            threads: Threads of one inference. Small networks are fastest with one.
-            state: What it must remember from decision to decision; None: nothing.
-
-        Raises:
-            ValueError: No ONNX, or other inputs or outputs.
+        It must take the observation, give the actions, and remember `state` between decisions,
+        None: nothing. Raises ValueError if it is no ONNX, or has other inputs or outputs.
         """
         import onnxruntime
 
@@ -138,16 +131,10 @@ class TorchRuntime:
         threads: int = 1,
         state: Shapes | None = None,
     ) -> None:
-        """Open a network.
+        """Open the bytes of a .pt2 file; `threads` count for the whole process.
 
-        Args:
-            program: The bytes of a .pt2 file.
-            observation: What it takes.
-            threads: Threads of torch, in the whole process.
-            state: What it remembers from decision to decision; None: nothing.
-
-        Raises:
-            ValueError: torch is not installed, or cannot load the program.
+        It remembers `state` between decisions, None: nothing. Raises ValueError if torch is not
+        installed, or cannot load the program.
         """
         try:
             import torch

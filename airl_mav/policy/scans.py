@@ -27,7 +27,7 @@ from airl_mav.policy.observation import Observation
 Floats = NDArray[np.float64]
 
 BAND_M = 0.9
-"""Returns so much higher or lower than the camera belong to the scan: a row of a coarse image
+"""Returns so much higher or lower than the camera belong to the scan. A row of a coarse image
 (2 degrees) is 0.7 m high at 20 m, so that one at least is inside."""
 
 NEAREST_M = 0.3
@@ -73,9 +73,7 @@ class Scanning(NamedTuple):
     """What makes scans."""
 
     level: Callable[[NDArray[np.uint16], Rays, Tilt, int], Floats]
-    """See `level_scan`."""
     carried: Callable[[Floats, Moved, float], Floats]
-    """See `carried`."""
 
 
 @cache
@@ -96,16 +94,10 @@ def tilt_of(roll: Floats, pitch: Floats) -> Tilt:
 
 
 def level_scan(depth_mm: NDArray[np.uint16], rays: Rays, tilt: Tilt, bearings: int) -> Floats:
-    """Return the ranges of what is about as high as the cameras.
+    """Return the nearest horizontal ranges (n, bearings) [m] at about the height of the cameras.
 
-    Args:
-        depth_mm: (n, h, w) depth images [mm], 0 = no return.
-        rays: Where their pixels look.
-        tilt: Their attitudes.
-        bearings: How many the scan has, from the left edge of the field of view to the right.
-
-    Returns:
-        (n, bearings) nearest horizontal ranges [m]; infinite: nothing is there.
+    `depth_mm` are (n, h, w) images, 0 = no return. Bearings go from the left edge of the field of
+    view to the right; infinite: nothing is there.
     """
     sr, cr, sp, cp = (np.asarray(each)[:, None, None] for each in tilt)
     depth = depth_mm / MM_PER_M
@@ -128,17 +120,10 @@ def level_scan(depth_mm: NDArray[np.uint16], rays: Rays, tilt: Tilt, bearings: i
 
 
 def carried(scans: Floats, moved: Moved, fov_rad: float) -> Floats:
-    """Return earlier scans as they would be if nothing but the vehicles had moved.
+    """Return earlier scans (n, bearings) as if nothing but the vehicles had moved.
 
-    A return is as wide as its bearing was from where it was seen. What was hidden stays unknown.
-
-    Args:
-        scans: (n, bearings) ranges [m]; infinite: nothing.
-        moved: How the vehicles have moved since.
-        fov_rad: Field of view of the scans [rad].
-
-    Returns:
-        (n, bearings).
+    Ranges [m] are infinite where nothing is. A return keeps its angular width. Hidden places stay
+    unknown.
     """
     bearings = scans.shape[1]
     step = fov_rad / bearings
@@ -172,17 +157,7 @@ NUMPY_SCANNING = Scanning(level_scan, carried)
 def scans_of(
     seen: Observation, frames: int, bearings: int, make: Scanning = NUMPY_SCANNING
 ) -> Floats:
-    """Return the scans of n vehicles, all as from where they are now.
-
-    Args:
-        seen: Depth images of n vehicles, and in what states they were seen.
-        frames: How many scans each: of this decision, and of those before.
-        bearings: How many each has.
-        make: What makes them.
-
-    Returns:
-        (n, frames, bearings) ranges [m], the newest first; infinite: nothing, or no frame yet.
-    """
+    """Return scans (n, frames, bearings) of n vehicles from here, the newest first [m]."""
     rays, now = rays_of(seen.intrinsics), seen.states[0]
     scans = np.full((len(seen.goal), frames, bearings), np.inf)
     images = (seen.depth_mm, *seen.earlier_mm)[:frames]

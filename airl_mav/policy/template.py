@@ -70,15 +70,8 @@ def write_template(
 ) -> PolicyCard:
     """Write a random network of the template and its card to a folder that exists.
 
-    Args:
-        folder: Where to write.
-        layers: Convolutions, and as many dense layers, >= 1.
-        filters: Filters of each, >= 1.
-        facts: What the card says beyond the network.
-        rng: Source of the weights.
-
-    Raises:
-        UsageError: The network is too large for one .onnx file.
+    It has `layers` >= 1 convolutions of so many filters, and as many dense layers. Raises
+    UsageError if it is too large for one .onnx file.
     """
     spec, outputs = facts.observation, outputs_of(facts.actions)
     shape, vectors = spec.image_shape, _vector_inputs(spec)

@@ -2,22 +2,28 @@
 
 A decision that takes t2 acts on a vehicle that has flown on meanwhile. But what it flies on is
 known: the setpoints that were sent. So the state is carried forward by the vehicle's response to
-them, to the moment at which the decision is expected to act; and the depth images are reprojected
+them, to the moment at which the decision is expected to act. And the depth images are reprojected
 to where the camera will be then. The policy need not have been trained for it.
+
+Vehicles answer velocity setpoints by a first-order model in closed form (`Response`): after a dead
+time the velocity approaches the setpoint with one time constant, the yaw rate with another. A
+setpoint in the heading frame turns with the nose, as PX4 turns it at every repetition. These are
+not the plant's equations: `scripts/fit-response` fits them to flown steps alone.
 
 The same code in the companion (n = 1) and in the batch twin (n at a time); numpy alone.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.core.constants import US_PER_MS, US_PER_S
+from airl_mav.core.constants import GRAVITY_M_S2, US_PER_MS, US_PER_S
 from airl_mav.core.errors import FieldError
 from airl_mav.core.frames import (
     Vector,
@@ -27,10 +33,65 @@ from airl_mav.core.frames import (
 )
 from airl_mav.policy.observation import Kinematics
 from airl_mav.prediction.memory import DecisionMemory
-from airl_mav.prediction.motion import Motion, flown_on, leaning
 from airl_mav.prediction.reprojection import CameraPose, Reprojector, Sight
 from airl_mav.profiles.camera import Camera
-from airl_mav.profiles.vehicle import VehicleProfile
+from airl_mav.profiles.vehicle import Response, VehicleProfile
+
+Array = NDArray[np.float64]
+
+
+class Motion(NamedTuple):
+    """How n vehicles move."""
+
+    position: Array  # (n, 3) NED [m]
+    velocity: Array  # (n, 3) NED [m/s]
+    heading: Array  # (n,) [rad]
+    heading_rate: Array  # (n,) [rad/s]
+
+
+def flown_on(motion: Motion, command: Array, response: Response, seconds: Array) -> Motion:
+    """Return the motion of vehicles after (n,) seconds on one setpoint (n, 4) each.
+
+    With the heading turning at the rate w from psi on, the horizontal velocity v as a complex
+    number (north + i east) follows T v' = c exp(i (psi + w t)) - v, whose solution is A exp(i w t)
+    + (v0 - A) exp(-t / T) with A = c exp(i psi) / (1 + i w T). While the turn itself still builds
+    up, psi is that of the turn it ends in. The setpoint is forward, right, down [m/s], yaw rate
+    [rad/s]. The response's dead time is left to the caller.
+    """
+    turn, lag, turn_lag = command[:, 3], response.velocity_time_s, response.yaw_rate_time_s
+    fading, turn_fading = np.exp(-seconds / lag), np.exp(-seconds / turn_lag)
+    lead = (motion.heading_rate - turn) * turn_lag
+    turned = turn * seconds
+    wanted = (command[:, 0] + 1j * command[:, 1]) * np.exp(1j * (motion.heading + lead))
+    follows = wanted / (1.0 + 1j * lag * turn)
+    velocity = motion.velocity[:, 0] + 1j * motion.velocity[:, 1] - follows
+    # The integral of exp(i w t); sinc has no trouble where w is zero.
+    arc = seconds * np.sinc(turned / (2.0 * math.pi)) * np.exp(0.5j * turned)
+    moved = follows * arc + velocity * (lag * (1.0 - fading))
+    velocity = follows * np.exp(1j * turned) + velocity * fading
+    sinking = motion.velocity[:, 2] - command[:, 2]
+    sunk = command[:, 2] * seconds + sinking * (lag * (1.0 - fading))
+    return Motion(
+        motion.position + np.stack([moved.real, moved.imag, sunk], axis=1),
+        np.stack([velocity.real, velocity.imag, command[:, 2] + sinking * fading], axis=1),
+        motion.heading + turned + lead * (1.0 - turn_fading),
+        turn + (motion.heading_rate - turn) * turn_fading,
+    )
+
+
+def leaning(motion: Motion, command: Array, response: Response) -> tuple[Array, Array]:
+    """Return the roll and pitch (n,) [rad] with which the vehicles fly on a setpoint (n, 4).
+
+    The thrust carries the weight and gives the acceleration and what the drag takes, so that it is
+    along the sum of the three.
+    """
+    course = np.exp(-1j * motion.heading)
+    velocity = (motion.velocity[:, 0] + 1j * motion.velocity[:, 1]) * course
+    wanted = command[:, 0] + 1j * command[:, 1]
+    push = (wanted - velocity) / response.velocity_time_s + response.drag_1_s * velocity
+    pitch = -np.arctan2(push.real, GRAVITY_M_S2)
+    return np.arctan2(push.imag * np.cos(pitch), GRAVITY_M_S2), pitch
+
 
 LINK_US = round(4.0 * US_PER_MS)
 """A setpoint is taken to be in effect so long after it was sent [µs]: a tick of the flight
@@ -55,11 +116,9 @@ class Compensator:
     ) -> None:
         """Prepare n companions of one vehicle, whose camera has these intrinsics.
 
-        So many images are `remembered`: the newest, and those that fill what it did not see.
-
-        Raises:
-            FieldError: The vehicle's profile does not say how it answers setpoints, or the camera
-                gives no depth.
+        So many images are `remembered`: the newest, and those that fill what it did not see. Raises
+        FieldError if the vehicle's profile does not say how it answers setpoints, or the camera
+        gives no depth.
         """
         if intrinsics.kind != "depth":
             raise FieldError(
@@ -128,16 +187,11 @@ class Compensator:
         now_us: NDArray[np.int64],
         state: Kinematics,
     ) -> tuple[NDArray[np.uint16], Kinematics]:
-        """Return what is seen, and how the vehicles move, when their decisions will act.
+        """Return images and motion of the vehicles at the time when their decisions will act.
 
-        Call it once a decision: the images are kept.
-
-        Args:
-            who: (k,) the companions that decide; the rows of others mean nothing.
-            depth_mm: (n, h, w) newest images, 0 = no return.
-            age_us: (n,) how long ago they were taken.
-            now_us: (n,) when the decisions begin.
-            state: Telemetry of all n.
+        Call it once a decision: the images are kept. Only the rows `who` (k,) decide. `depth_mm`
+        (n, h, w) are the newest images, 0 = no return. They were taken `age_us` (n,) ago. The
+        decisions begin at `now_us` (n,).
         """
         roll, pitch, heading = quats_to_euler(state.quaternion)
         now = Motion(state.position, state.velocity, heading, self._heading_rate(now_us))
@@ -171,14 +225,10 @@ class Compensator:
         sent_us: NDArray[np.int64],
         stopped_us: NDArray[np.int64] | None = None,
     ) -> None:
-        """Take the setpoints that were sent.
+        """Take the setpoints (k, 4) forward, right, down [m/s], yaw rate [rad/s] that were sent.
 
-        Args:
-            who: (k,) the companions that sent one.
-            command: (k, 4) forward, right, down [m/s], yaw rate [rad/s].
-            t2_us: (k,) what the decisions took.
-            sent_us: (k,) when they were sent.
-            stopped_us: (k,) when each will be replaced by a stop if no other has come; None: never.
+        The decisions took `t2_us` (k,); `stopped_us` (k,) is when a stop replaces each if no other
+        has come, None: never.
         """
         self.memory.decided(who, command, t2_us)
         for array in (self._setpoint, self._answered_us):

@@ -1,8 +1,8 @@
 """A depth image as it would be from elsewhere, made of the newest images.
 
-Every pixel with a return is a point; points are carried into the other camera, and the nearest of
+Every pixel with a return is a point. Points are carried into the other camera, and the nearest of
 those that fall on a pixel is seen there. What the newest image saw decides; where it saw nothing of
-a pixel (beyond its edges, behind something) older images do; where no image did, level ground at
+a pixel (beyond its edges, behind something) older images do. Where no image did, level ground at
 the height of the take-off is assumed, and above the horizon that nothing is there. What moves is
 taken to stand still.
 """
@@ -16,9 +16,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from airl_mav.camera.equidistant import fisheye_places, fisheye_rays
 from airl_mav.camera.frame import MAX_MM, MM_PER_M
 from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.rays import fisheye_places, fisheye_rays
 from airl_mav.profiles.camera import Camera
 
 LEAST_DEPTH_M = 0.05
@@ -71,12 +71,7 @@ class Reprojector:
         """(h w) whether a pixel looks anywhere: not outside of a fisheye's circle."""
 
     def image(self, sights: Sequence[Sight], pose: CameraPose) -> Image:
-        """Return the depth image (h, w) [mm] from a pose; 0 = no return.
-
-        Args:
-            sights: What was seen; the newest first.
-            pose: Where the camera is to be.
-        """
+        """Return the depth image (h, w) [mm] from a pose. The newest sight is first."""
         k, size = self._k, self._rays.shape[1]
         nearest = np.full(size, _UNSEEN, np.uint32)
         for rank, sight in enumerate(sights):

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from airl_mav.core.fields import Each, ProfileModel, later_field, quantity
-from airl_mav.profiles.image_file import MOST_IMAGES, ImageFile
+from airl_mav.profiles.asset_files import MOST_IMAGES, ImageFile
 
 TextureName = Literal["plain", "checker", "noise", "brick", "foliage"]
 SurfaceName = Literal["matt", "glossy", "metal", "glass"]
@@ -293,10 +293,7 @@ class Appearance(ProfileModel):
         return tuple(dict.fromkeys(m.image for _, m in named if m.image is not None))
 
     def may_have(self, surface: SurfaceName, more: Iterable[str] = ()) -> bool:
-        """Return whether any obstacle may have such a surface.
-
-        `more`: the names of further materials that parts of them have.
-        """
+        """Return whether an obstacle, or a part of one in `more` materials, may be so."""
         kinds = (*self.static.materials, *self.moving.materials, *more)
         return any(self.material(name, (0, 0, 0)).surface == surface for name in kinds)
 

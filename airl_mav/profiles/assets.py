@@ -12,8 +12,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from airl_mav.core.fields import ProfileModel, later_field, quantity
-from airl_mav.profiles.mesh_file import MeshFile
+from airl_mav.core.fields import ProfileModel, later_field, optional, quantity
+from airl_mav.profiles.asset_files import MeshFile
 
 MOST_PARTS = 128
 """Parts of one asset: every ray and every contact looks at each."""
@@ -31,9 +31,8 @@ class _Placed(ProfileModel):
     bottom_m: float = quantity(
         "height of its underside above the floor", "m", ge=0, le=50, default=0
     )
-    material: str | None = Field(
-        default=None,
-        description="a material by name; left out: one that is drawn for the whole asset",
+    material: str | None = optional(
+        "a material by name; left out: one that is drawn for the whole asset"
     )
 
     @property

@@ -16,7 +16,7 @@ from pydantic import Field, model_validator
 
 from airl_mav.core.constants import G_PER_KG
 from airl_mav.core.errors import UsageError
-from airl_mav.core.fields import ProfileModel, later_field, quantity
+from airl_mav.core.fields import ProfileModel, later_field, optional, quantity, switch
 from airl_mav.core.files import replace_file
 from airl_mav.profiles.loading import load_profile, profiles_dir
 
@@ -66,9 +66,8 @@ class Latency(ProfileModel):
     samples_ms: tuple[Annotated[float, Field(gt=0, le=LONGEST_MS)], ...] | None = Field(
         default=None, description="measured latencies", json_schema_extra={"unit": "ms"}
     )
-    samples_file: str | None = Field(
-        default=None,
-        description="text file of measured latencies beside the profile, one a line in ms",
+    samples_file: str | None = optional(
+        "text file of measured latencies beside the profile, one a line in ms"
     )
 
     @model_validator(mode="after")
@@ -124,8 +123,8 @@ class Workload(ProfileModel):
     """One network on one runtime, as this computer ran it."""
 
     network: Network
-    policy_sha256: str | None = Field(
-        default=None, description="digest of the policy file that was timed, if it was one of ours"
+    policy_sha256: str | None = optional(
+        "digest of the policy file that was timed, if it was one of ours"
     )
     latency: Latency
     source: str = Field(description="where the latency comes from")
@@ -164,9 +163,8 @@ class ComputerProfile(ProfileModel):
         le=100_000,
         default=0.0,
     )
-    ground_equipment: bool = Field(
-        default=False,
-        description="it stays on the ground: neither its mass nor its watts are the aircraft's",
+    ground_equipment: bool = switch(
+        "it stays on the ground: neither its mass nor its watts are the aircraft's"
     )
     price_usd: float = quantity("price", "USD", ge=0, le=1_000_000)
     source: str = Field(description="where the numbers come from")
@@ -188,9 +186,8 @@ class ComputerProfile(ProfileModel):
 def load_computer(name: str) -> ComputerProfile:
     """Load a computer profile, shipped or by path, with its sample files read in.
 
-    Raises:
-        UsageError: See `load_profile`; also when a sample file is missing or holds anything but
-            latencies in (0, 60000] ms.
+    Raises UsageError: see `load_profile`; also when a sample file is missing or holds anything but
+    latencies in (0, 60000] ms.
     """
     profile = load_profile("computers", name, ComputerProfile)
     folder = Path(name).parent if name.endswith(".toml") else profiles_dir() / "computers"
@@ -212,12 +209,8 @@ def _with_samples(latency: Latency, folder: Path) -> Latency:
 def read_samples(path: Path, option: str) -> tuple[float, ...]:
     """Read a text file of measured latencies in their order: one a line in ms, # for remarks.
 
-    Args:
-        path: The file.
-        option: The option or field that names it, for messages.
-
-    Raises:
-        UsageError: It cannot be read, is empty, or holds anything but latencies in (0, 60000] ms.
+    `option` names the file in messages. Raises UsageError if it cannot be read, is empty, or holds
+    anything but latencies in (0, 60000] ms.
     """
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
@@ -239,10 +232,7 @@ def read_samples(path: Path, option: str) -> tuple[float, ...]:
 
 
 def existing_profile(path: Path, cpu: str) -> ComputerProfile | None:
-    """Return the profile that a .toml file holds, None when there is no such file.
-
-    Raises UsageError if it is no computer profile, or that of another processor than `cpu`.
-    """
+    """Return the profile in a .toml file, None without one. Raises UsageError for another CPU's."""
     if not path.exists():
         return None
     profile = load_profile("computers", str(path), ComputerProfile)

@@ -34,10 +34,7 @@ class WindSettings(ProfileModel):
 
 
 class Payload(ProfileModel):
-    """A load that is carried as one point of mass; none by default.
-
-    Where it hangs counts from the middle of the rotors.
-    """
+    """A point of mass, placed from the middle of the rotors; none by default."""
 
     mass_g: float = quantity("mass of the payload", "g", ge=0, le=100_000, default=0.0)
     forward_m: float = quantity("ahead of the middle", "m", ge=-2, le=2, default=0.0)

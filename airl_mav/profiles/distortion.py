@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from airl_mav.core.errors import FieldError
-from airl_mav.profiles.projection import FISHEYE_MOST_DEG, Projection
+from airl_mav.profiles.camera_kind import FISHEYE_MOST_DEG, Projection
 
 Distortion = tuple[float, float, float, float]
 """k1, k2, k3, k4."""

@@ -57,12 +57,8 @@ def check_gates(
 ) -> None:
     """Raise ValueError for gates that no arena of a size can have.
 
-    Args:
-        gates: At least one.
-        west_m: From the start to the west wall [m].
-        east_m: From the start to the east wall [m].
-        height_m: Of the walls [m].
-        free_m: Free way around the start [m].
+    `west_m` and `east_m` are from the start to the walls of `height_m`; `free_m` is free around the
+    start.
     """
     nearest = free_m + 0.5 * gates.thickness_m
     if gates.first_m[0] < nearest:

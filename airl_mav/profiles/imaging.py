@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import SerializerFunctionWrapHandler, model_serializer, model_validator
 
-from airl_mav.core.fields import ProfileModel, quantity
+from airl_mav.core.fields import ProfileModel, optional, quantity, switch
 
 
 class AutoExposure(ProfileModel):
@@ -72,8 +72,8 @@ class Imaging(ProfileModel):
         le=8,
         default=0.0,
     )
-    auto_exposure: AutoExposure | None = Field(
-        default=None, description="how the gain follows the light; left out: it is `gain`"
+    auto_exposure: AutoExposure | None = optional(
+        "how the gain follows the light; left out: it is `gain`"
     )
     vignetting: float = quantity(
         "share of the light that the farthest corner lacks; it grows with the square of the"
@@ -98,10 +98,9 @@ class Imaging(ProfileModel):
         le=10_000,
         default=0.0,
     )
-    bayer: bool = Field(
-        default=False,
-        description="whether each pixel measures one colour (mosaic RGGB) and the others are"
-        " interpolated bilinearly; only of kind rgb",
+    bayer: bool = switch(
+        "whether each pixel measures one colour (mosaic RGGB) and the others are"
+        " interpolated bilinearly; only of kind rgb"
     )
     jpeg_quality: int | None = quantity(
         "images are compressed as JPEG of this quality, by libjpeg's scale; left out: they are not",

@@ -15,18 +15,12 @@ def loaded(
 ) -> VehicleProfile:
     """Return a vehicle with what it carries; with nothing to carry, the vehicle itself.
 
-    Computer and payload are points of mass, the computer in the middle of the rotors. Mass, centre
-    of mass and inertia about it follow (parallel axes). Left out: products of inertia, and how far
-    below the rotors the centre of mass comes to lie, which no force here acts on. Collision body,
-    drag and camera stay where they were against the centre of mass.
-
-    Args:
-        vehicle: As its profile has it.
-        computer: What flies along, unless it is ground equipment; None: no computer.
-        payload: The payload.
-
-    Raises:
-        FieldError: The rotors do not carry it with a margin, or not so far off their middle.
+    Computer and payload are points of mass. The computer is in the middle of the rotors. Ground
+    equipment does not fly along. Mass, centre of mass and inertia about it follow (parallel axes).
+    Collision body, drag and camera stay where they were against the centre of mass. Products of
+    inertia are left out. So is the height of the centre of mass below the rotors, on which no force
+    here acts. Raises FieldError if the rotors do not carry it with a margin, or not so far off
+    their middle.
     """
     board_kg = 0.0 if computer is None else computer.onboard_mass_kg
     load_kg = payload.mass_g / G_PER_KG
@@ -71,11 +65,7 @@ def loaded(
 def equipped(
     vehicle: str, computer: str, payload: Payload
 ) -> tuple[VehicleProfile, ComputerProfile]:
-    """Load a vehicle and a computer by name or path; return the vehicle `loaded`, and the computer.
-
-    Raises:
-        UsageError: A profile cannot be used, or the rotors do not carry it all.
-    """
+    """Return a vehicle, `loaded`, and its computer, by names or paths. Raises UsageError."""
     board = load_computer(computer)
     return loaded(load_vehicle(vehicle), board, payload), board
 

@@ -13,7 +13,7 @@ from pydantic import BaseModel
 from airl_mav.core.errors import UsageError, shown
 from airl_mav.core.fields import validated
 from airl_mav.core.files import DEEPEST, deeper_than
-from airl_mav.profiles.mesh_file import CONTENT, CheckedFile, read_checked
+from airl_mav.profiles.asset_files import CONTENT, CheckedFile, read_checked
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -53,10 +53,7 @@ def list_profiles(kind: Kind) -> list[str]:
 
 
 def describe_profile(kind: Kind, name: str) -> str:
-    """Return the line in which a shipped profile describes itself, "" when it has none.
-
-    Raises UsageError when there is no such profile, or it is no TOML.
-    """
+    """Return a shipped profile's description, "" without one. Raises UsageError."""
     return str(_read(kind, _path(kind, name), ()).get("description", ""))
 
 
@@ -64,10 +61,8 @@ def load_profile(kind: Kind, name: str, model: type[Model]) -> Model:
     """Load a shipped profile by name, or any file by path (recognised by its .toml suffix).
 
     A file with `base = "NAME"` is that profile, or that path, with what the file says put over it.
-
-    Raises:
-        UsageError: The profile does not exist (lists those that do), is no TOML, or has a field
-            that is missing, unknown, of the wrong type or out of range.
+    Raises UsageError if the profile does not exist (lists those that do), is no TOML, or has a
+    field that is missing, unknown, of the wrong type or out of range.
     """
     path = _path(kind, name)
     data = _read(kind, path, ())
@@ -160,8 +155,7 @@ def _check_file(named: CheckedFile, path: Path, table: str) -> None:
 def _name_power_model(data: dict[str, Any], path: Path) -> None:
     """Say of a nine-coefficient table `power` that it is one: before 0.3 there was no other.
 
-    Raises:
-        UsageError: It has a payload, which is no part of the power model any more.
+    Raises UsageError if it has a payload, which is no part of the power model any more.
     """
     power = data.get("power")
     if not isinstance(power, dict) or "b1_vxy" not in power or "model" in power:

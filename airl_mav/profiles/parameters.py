@@ -85,10 +85,7 @@ _FLOWN_DEFAULTS = {spec.name: spec.flown(spec.default) for spec in SPECS}
 
 
 def parameter_values(overrides: Mapping[str, int | float]) -> dict[str, int | float]:
-    """Return the values of all parameters: the defaults, and a vehicle profile's overrides.
-
-    Raises UsageError for an override that is unknown or out of PX4's range.
-    """
+    """Return all parameters, with a vehicle profile's overrides. Raises UsageError."""
     values = dict(_DEFAULTS)
     for name, value in overrides.items():
         spec = SPEC_BY_NAME.get(name)

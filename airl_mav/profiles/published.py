@@ -6,7 +6,7 @@ from functools import cache
 
 from pydantic import Field
 
-from airl_mav.core.fields import ProfileModel
+from airl_mav.core.fields import ProfileModel, optional
 from airl_mav.profiles.loading import load_profile
 
 
@@ -18,7 +18,7 @@ class PublishedRun(ProfileModel):
     flight_time_s: float
     distance_m: float
     energy_kj: float = Field(description="of the vehicle, without its computer")
-    success_percent: float | None = Field(default=None, description="None: not given")
+    success_percent: float | None = optional("None: not given")
 
 
 class PublishedGap(ProfileModel):
@@ -73,10 +73,7 @@ def load_published(name: str = "air-learning") -> Published:
 
 
 def published_gap(reference: PublishedRun, target: PublishedRun) -> PublishedGap:
-    """Work out the differences of two published columns by our own definition, signed.
-
-    They are in percent of the reference; success in percentage points, 0 where it is not given.
-    """
+    """Return the differences of two published columns, signed: percent, success in points."""
 
     def percent(key: str) -> float:
         first, second = getattr(reference, key), getattr(target, key)

@@ -83,12 +83,7 @@ def check_rooms(
 ) -> None:
     """Raise ValueError for rooms that no arena of a size can have.
 
-    Args:
-        rooms: One at least.
-        north_m: Length of the floor, south to north [m].
-        east_m: Width of the floor, west to east [m].
-        height_m: Of the walls [m].
-        flight_altitude_m: Height above the floor at which a vehicle must fit through doors [m].
+    The floor is `north_m` x `east_m`; a vehicle must fit through doors at the flight altitude.
     """
     if rooms.count[0] == 0:
         raise ValueError(

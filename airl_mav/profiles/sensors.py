@@ -5,7 +5,7 @@ from __future__ import annotations
 from pydantic import Field, model_validator
 from typing_extensions import Self
 
-from airl_mav.core.fields import ProfileModel, later_field, quantity
+from airl_mav.core.fields import ProfileModel, later_field, optional, quantity
 
 
 class Imu(ProfileModel):
@@ -50,7 +50,7 @@ class Vision(ProfileModel):
     """Visual-inertial odometry, or a motion capture system: the pose in a frame of its own.
 
     The frame is the vehicle's at the start. What drifts does so with the way and with time, for
-    good: nothing is seen a second time.
+    good. Nothing is seen a second time.
     """
 
     rate_hz: float = quantity("poses a second", "Hz", ge=5, le=250)
@@ -119,11 +119,11 @@ class Sensors(ProfileModel):
     magnetometer: Magnetometer
     barometer: Barometer
     gps: Gps
-    vision: Vision | None = Field(
-        default=None, description="what tells the flight controller its pose; absent = nothing does"
+    vision: Vision | None = optional(
+        "what tells the flight controller its pose; absent = nothing does"
     )
-    rangefinder: Rangefinder | None = Field(
-        default=None, description="what measures how far the ground is; absent = nothing does"
+    rangefinder: Rangefinder | None = optional(
+        "what measures how far the ground is; absent = nothing does"
     )
     optical_flow: OpticalFlow | None = later_field(
         None, "what measures how the ground moves below; absent = nothing does"

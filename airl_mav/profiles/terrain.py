@@ -62,12 +62,8 @@ def check_terrain(
 ) -> None:
     """Raise ValueError for hills that no arena of a size can have.
 
-    Args:
-        terrain: Such that there are any.
-        north_m: Length of the floor, south to north [m].
-        east_m: Width of the floor, west to east [m].
-        height_m: Of the walls [m].
-        start_m: From the south and from the west wall to the start [m].
+    The floor is `north_m` x `east_m`; `start_m` is from the south and from the west wall to the
+    start.
     """
     least, greatest = terrain.relief_m
     # Nothing stands on a hill that is as high as the walls.

@@ -12,11 +12,9 @@ from pydantic import (
 
 from airl_mav.core.constants import C_PER_MAH, GRAVITY_M_S2
 from airl_mav.core.errors import FieldError, UsageError
-from airl_mav.core.fields import ProfileModel, later_field, quantity
-from airl_mav.core.frames import Geodetic
-from airl_mav.core.location import HOME
-from airl_mav.profiles.camera import Camera
-from airl_mav.profiles.further_cameras import FurtherCameras, check_rates, with_the_rate
+from airl_mav.core.fields import ProfileModel, later_field, optional, quantity
+from airl_mav.core.frames import HOME, Geodetic
+from airl_mav.profiles.camera import Camera, FurtherCameras, check_rates, with_the_rate
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.parameters import SPECS, parameter_values
 from airl_mav.profiles.sensors import Sensors
@@ -259,20 +257,19 @@ class VehicleProfile(ProfileModel):
         " their rate_hz is left out",
     )
     sensors: Sensors
-    estimation: Estimation | None = Field(
-        default=None, description="error of the estimator on these sensors; absent = not known"
+    estimation: Estimation | None = optional(
+        "error of the estimator on these sensors; absent = not known"
     )
-    response: Response | None = Field(
-        default=None,
-        description="how it answers velocity setpoints; absent = not known: its decisions' latency"
-        " cannot be compensated",
+    response: Response | None = optional(
+        "how it answers velocity setpoints; absent = not known: its decisions' latency"
+        " cannot be compensated"
     )
     parameters: ParameterTable = Field(
         default_factory=dict,
         description="PX4-named parameters of the built-in autopilot that differ from the defaults",
     )
-    px4: Px4 | None = Field(default=None, description="for --firmware px4 and px4-hitl")
-    ardupilot: ArduPilot | None = Field(default=None, description="for --firmware ardupilot")
+    px4: Px4 | None = optional("for --firmware px4 and px4-hitl")
+    ardupilot: ArduPilot | None = optional("for --firmware ardupilot")
 
     @model_validator(mode="before")
     @classmethod
@@ -291,10 +288,7 @@ class VehicleProfile(ProfileModel):
         return self
 
     def too_heavy(self, mass_kg: float, thrust_share: float = 1.0) -> str | None:
-        """Return why the rotors do not carry a mass with a margin to fly with; None: they do.
-
-        They give `thrust_share` of the thrust that the profile says.
-        """
+        """Return why the rotors, at a share of their thrust, do not carry a mass with a margin."""
         needed_n = (1.0 + THRUST_MARGIN) * mass_kg * GRAVITY_M_S2
         thrust_n = thrust_share * self.thrust_n
         if thrust_n >= needed_n:
@@ -326,21 +320,14 @@ class VehicleProfile(ProfileModel):
         return len(CORNERS) * self.rotor.thrust_max_n
 
     def autopilot_parameters(self) -> dict[str, float]:
-        """Return what the built-in autopilot is set to: its rotors' places, what `parameters` say.
-
-        By PX4's names; only those that it has.
-        """
+        """Return the built-in autopilot's parameters: its rotors' places, and `parameters`."""
         known = {spec.name for spec in SPECS}
         places = {n: v for n, v in self.rotor.px4_geometry().items() if n in known}
         return {**places, **self.parameters}
 
 
 def load_vehicle(name: str) -> VehicleProfile:
-    """Return a vehicle profile by name or path.
-
-    Raises UsageError when it cannot be used, or sets a parameter that the flight controller does
-    not know or accept.
-    """
+    """Return a vehicle profile by name or path, or raise UsageError."""
     vehicle = load_profile("vehicles", name, VehicleProfile)
     try:
         parameter_values(vehicle.parameters)

@@ -1,6 +1,6 @@
 """Fit of a vehicle's response to setpoints: dead time, time constants of velocity and yaw rate.
 
-The model is that of `prediction.motion`, driven by the sent setpoints and the flown heading.
+The model is that of `prediction.compensator`, driven by the sent setpoints and the flown heading.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from airl_mav.core.compiling import heard_compiling
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.core.ports import LOOPBACK
-from airl_mav.core.signing_key import StoredSigning
+from airl_mav.core.signing import StoredSigning
 from airl_mav.faults.kinds import PROCESSES
 from airl_mav.faults.model import Fault, link_fails
 from airl_mav.profiles.vehicle import VehicleProfile

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from airl_mav.core.fields import ProfileModel, quantity
+from airl_mav.core.fields import ProfileModel, optional, quantity, switch
 from airl_mav.faults.model import Fault
 from airl_mav.profiles.camera_kind import Renderer
 from airl_mav.profiles.conditions import Payload, SensorNoise, Spread, WindSettings
@@ -77,24 +77,17 @@ class Ports(ProfileModel):
 class RealFirmware(ProfileModel):
     """Real firmware: what to start, or how to reach what the user has started."""
 
-    px4_dir: Path | None = Field(
-        default=None,
-        description="with firmware px4: start this PX4 for every flight; a SITL build, its source"
-        " tree, or an unpacked package",
+    px4_dir: Path | None = optional(
+        "with firmware px4: start this PX4 for every flight; a SITL build, its source"
+        " tree, or an unpacked package"
     )
-    px4_connect: bool = Field(
-        default=False,
-        description="with firmware px4: wait for a PX4 that you start for every flight",
+    px4_connect: bool = switch("with firmware px4: wait for a PX4 that you start for every flight")
+    ardupilot_dir: Path | None = optional(
+        "with firmware ardupilot: start this ArduCopter for every flight; a SITL build,"
+        " its source tree, or the program itself"
     )
-    ardupilot_dir: Path | None = Field(
-        default=None,
-        description="with firmware ardupilot: start this ArduCopter for every flight; a SITL build,"
-        " its source tree, or the program itself",
-    )
-    ardupilot_connect: bool = Field(
-        default=False,
-        description="with firmware ardupilot: wait for an ArduCopter that you start for every"
-        " flight",
+    ardupilot_connect: bool = switch(
+        "with firmware ardupilot: wait for an ArduCopter that you start for every flight"
     )
     instance: int = quantity(
         "instance number: moves all ports of the flight controller and that of the camera, as PX4's"
@@ -105,8 +98,8 @@ class RealFirmware(ProfileModel):
         le=GREATEST_INSTANCE,
         default=0,
     )
-    serial: str | None = Field(
-        default=None, description="with firmware px4-hitl: serial device of the board: /dev/ttyACM0"
+    serial: str | None = optional(
+        "with firmware px4-hitl: serial device of the board: /dev/ttyACM0"
     )
     baud: int = quantity(
         "with serial: bits a second; USB takes no notice of it",
@@ -122,10 +115,9 @@ class RealFirmware(ProfileModel):
         le=3600,
         default=60.0,
     )
-    firmware_dir: Path | None = Field(
-        default=None,
-        description="keep what real firmware leaves (parameters, flight logs) in this folder, one"
-        " folder a flight; by default it is removed",
+    firmware_dir: Path | None = optional(
+        "keep what real firmware leaves (parameters, flight logs) in this folder, one"
+        " folder a flight; by default it is removed"
     )
 
 
@@ -168,10 +160,9 @@ class Aircraft(ProfileModel):
         " sensors; see docs/how-to/real-firmware.md",
     )
     real: RealFirmware = Field(default_factory=RealFirmware, description="real firmware")
-    signing_key: Annotated[Path | None, FREE] = Field(
-        default=None,
-        description="sign MAVLink with the key in this file (64 hexadecimal digits, mode 0600), and"
-        " refuse what is not signed with it",
+    signing_key: Annotated[Path | None, FREE] = optional(
+        "sign MAVLink with the key in this file (64 hexadecimal digits, mode 0600), and"
+        " refuse what is not signed with it"
     )
     ports: Annotated[Ports, FREE] = Field(default_factory=Ports, description="ports")
 

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 from airl_mav.core.errors import FieldError
 from airl_mav.faults.kinds import LINKS
-from airl_mav.faults.model import Fault
-from airl_mav.faults.twin import TWIN, check_twin
+from airl_mav.faults.model import TWIN, Fault, check_twin
 from airl_mav.profiles.camera_kind import SLOW, Renderer
 from airl_mav.profiles.sensors import Sensors
 from airl_mav.scenario.aircraft import GREATEST_PORT, HAS_PYBULLET, NO_TWIN, Aircraft, Ports
@@ -106,12 +105,7 @@ def check_plant(asked: Aircraft) -> None:
 
 
 def check_ports(ports: Ports, *, any_camera: bool) -> None:
-    """Raise FieldError for a port that no client could be told, or two links on one port.
-
-    Args:
-        ports: What was asked for.
-        any_camera: Whether the camera's port may be 0, any free one.
-    """
+    """Raise FieldError for an unusable port, or two links on one; 0, if `any_camera`, is free."""
     for field in ("api_port", "gcs_port", *(() if any_camera else ("camera_port",))):
         if getattr(ports, field) == 0:
             raise FieldError(f"ports.{field}", 0, "1 <= value <= 65535")
@@ -123,13 +117,7 @@ def check_ports(ports: Ports, *, any_camera: bool) -> None:
 
 
 def check_firmware(asked: Aircraft, level: LevelName, speed: float | str | None) -> None:
-    """Raise FieldError for real firmware that is asked for in a way that cannot be.
-
-    Args:
-        asked: What flies.
-        level: Rung of the fidelity ladder.
-        speed: Simulated seconds per wall second; None: as usual.
-    """
+    """Raise FieldError for options that real firmware does not support; None: default speed."""
     firmware, real = asked.firmware, asked.real
     if asked.signing_key is not None and (level != "sitl" or firmware != "builtin"):
         accepted = "at level sitl, with firmware builtin"

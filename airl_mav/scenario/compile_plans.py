@@ -36,7 +36,7 @@ def flight_plan(vehicle: VehicleProfile, plant: PlantName) -> CompilePlan:
 
 
 def vectorized_plan(kind: CameraKind) -> CompilePlan:
-    """Return what level gym and a training need, by the kind of the main camera's images."""
+    """Return the kernels of level gym and of a training, by the main camera's kind."""
     return CompilePlan(
         "vectorized",
         kind,

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, ModelWrapValidatorHandler, ValidationError, model_validator
 
 from airl_mav.core.constants import CommandKind
-from airl_mav.core.fields import ProfileModel, field_error, quantity
+from airl_mav.core.fields import ProfileModel, field_error, optional, quantity, switch
 from airl_mav.flight.judge import TIME_LIMIT_S, GoalRadius, TimeLimit
 from airl_mav.policy.actions import UPRIGHT_S, DecisionTiming
 from airl_mav.scenario.aircraft import FREE, NO_TWIN, Aircraft
@@ -93,13 +93,7 @@ class WatchdogSettings(ProfileModel):
         hold_s: float = 0.0,
         on_card: float | None = None,
     ) -> float:
-        """Return the time-out of a decision [s]: as asked for, as on the card, or by default.
-
-        Args:
-            commands: What the policy commands.
-            hold_s: How long each of its actions is held [s].
-            on_card: What the policy's card says [s]; None: nothing.
-        """
+        """Return the time-out of a decision [s]: as configured, as on the card, or by default."""
         if self.decision_timeout_s is not None:
             return self.decision_timeout_s
         if on_card is not None:
@@ -183,10 +177,9 @@ class Inference(ProfileModel):
         default="onnx", description="what runs a learned policy; torch needs its policy.pt2"
     )
     threads: int = quantity("threads of one inference", "1", ge=1, le=64, default=1)
-    trust: bool = Field(
-        default=False,
-        description="run policy.pt2, or code that the card names, of a folder that is not shipped:"
-        " both execute what its author wrote",
+    trust: bool = switch(
+        "run policy.pt2, or code that the card names, of a folder that is not shipped:"
+        " both execute what its author wrote"
     )
 
 
@@ -216,10 +209,9 @@ class Decisions(Inference):
         le=100,
         default=None,
     )
-    goal_radius_m: GoalRadius | None = Field(
-        default=None,
-        description="the goal is reached closer than this: seen from above, if it has no height; by"
-        " default that of the policy's card, or 3",
+    goal_radius_m: GoalRadius | None = optional(
+        "the goal is reached closer than this: seen from above, if it has no height; by"
+        " default that of the policy's card, or 3"
     )
     max_speed_m_s: Annotated[float | None, NO_TWIN] = quantity(
         "horizontal speed limit of all actions; by default the fastest action of the policy's card,"
@@ -229,24 +221,21 @@ class Decisions(Inference):
         le=30,
         default=None,
     )
-    decisions: DecisionTiming | None = Field(
-        default=None,
-        description="sequential: a decision begins after the hold of the one before; pipelined:"
+    decisions: DecisionTiming | None = optional(
+        "sequential: a decision begins after the hold of the one before; pipelined:"
         " with the newest frame as soon as the one before is ready; by default as the policy's card"
-        " says, or sequential",
+        " says, or sequential"
     )
-    compensate: bool | None = Field(
-        default=None,
-        description="compensate the latency: state and depth image are carried forward to when the"
+    compensate: bool | None = optional(
+        "compensate the latency: state and depth image are carried forward to when the"
         " decision is expected to act, by the vehicle's response to the setpoints in flight; by"
-        " default as the policy's card says, or not",
+        " default as the policy's card says, or not"
     )
-    origin: Annotated[Place | None, NO_TWIN] = Field(
-        default=None,
-        description="where on the globe the flight begins: latitude, longitude (degrees), altitude"
+    origin: Annotated[Place | None, NO_TWIN] = optional(
+        "where on the globe the flight begins: latitude, longitude (degrees), altitude"
         " above mean sea level (m). A flight controller without GPS is told it before it is armed,"
         " as it flies Hold only where it knows its place; by default, in a rehearsal without GPS,"
-        " the place of all rehearsals",
+        " the place of all rehearsals"
     )
     watchdog: WatchdogSettings = Field(
         default_factory=WatchdogSettings, description="bounds on silence"
@@ -255,9 +244,8 @@ class Decisions(Inference):
         default_factory=LimitSettings,
         description="what the companion believes of telemetry and camera, and how far it flies",
     )
-    ablate: AblationName | None = Field(
-        default=None,
-        description="input of the network that is made zero; not at level sitl",
+    ablate: AblationName | None = optional(
+        "input of the network that is made zero; not at level sitl"
     )
 
 
@@ -268,17 +256,15 @@ class Lateness(ProfileModel):
         default="workstation",
         description="computer profile to fly as: a shipped name, or a path to a .toml",
     )
-    workload: str | None = Field(
-        default=None,
-        description="workload of the computer profile whose latency t2 is injected; estimate:"
+    workload: str | None = optional(
+        "workload of the computer profile whose latency t2 is injected; estimate:"
         " scaled to this policy; by default what was measured for this very policy, or else what"
-        " this machine takes (sitl) or 1 ms (gym, lockstep)",
+        " this machine takes (sitl) or 1 ms (gym, lockstep)"
     )
-    latency: str | None = Field(
-        default=None,
-        description="latency t2 to inject instead of the workload's: 150ms, lognormal:396ms,20ms"
+    latency: str | None = optional(
+        "latency t2 to inject instead of the workload's: 150ms, lognormal:396ms,20ms"
         " (mean, standard deviation), normal:396ms,20ms, COMPUTER/WORKLOAD, or a file of measured"
-        " latencies, one a line in ms, which are replayed in order",
+        " latencies, one a line in ms, which are replayed in order"
     )
     latency_seed: int = _seed(
         "draws the same latency anew on the same episodes; 0: from the episodes' own seeds", 0
@@ -358,10 +344,8 @@ class Flights(Workers):
         le=GREATEST_SLOTS,
         default=128,
     )
-    tlogs: Annotated[bool, FREE] = Field(
-        default=False,
-        description="level lockstep: write the logs of every flight (.tlog, .ulg); level sitl"
-        " always does",
+    tlogs: Annotated[bool, FREE] = switch(
+        "level lockstep: write the logs of every flight (.tlog, .ulg); level sitl always does"
     )
 
 
@@ -370,10 +354,8 @@ class Scenario(Flights, Lateness, Decisions, Aircraft):
 
     The fields are flat, but for the tables `payload`, `wind`, `spread`, `sensors`, `watchdog`,
     `limits`, `real` and `ports`. What is left at None is decided by
-    `airl_mav.scenario.resolve.resolve`, mostly from the policy's card.
-
-    Raises:
-        FieldError: A field is unknown, of the wrong type, or out of range.
+    `airl_mav.scenario.resolve.resolve`, mostly from the policy's card. Raises FieldError if a field
+    is unknown, of the wrong type, or out of range.
     """
 
     policy: PolicyName = DEFAULT_POLICY

@@ -36,15 +36,10 @@ TRANSPORT_US = round(5.0 * US_PER_MS)
 def decide_piloting(
     asked: Decisions, policy: PolicyInfo, goal_radius_m: float
 ) -> tuple[PilotSettings, WatchdogSettings]:
-    """Return how a policy is flown: as asked, else as its card says, else by default.
+    """Return how a policy is flown: as configured, else as on its card, else by default.
 
-    Args:
-        asked: What was asked for.
-        policy: What flies.
-        goal_radius_m: Goal radius of a policy without a card [m].
-
-    Raises:
-        FieldError: A decision would be overdue before its predecessor's hold time is over.
+    `goal_radius_m` is that of a policy without a card. Raises FieldError if a decision would be
+    overdue before its predecessor's hold time is over.
     """
     card = policy.card
     known: dict[str, Any] = {"goal_radius_m": goal_radius_m}
@@ -85,14 +80,7 @@ def decide_piloting(
 def check_commands(
     policy: PolicyInfo, asked: str, *, level: str, firmware: str = "builtin"
 ) -> None:
-    """Raise FieldError for a policy that commands what cannot be flown so.
-
-    Args:
-        policy: What flies.
-        asked: Its name, as it was asked for.
-        level: Rung of the fidelity ladder.
-        firmware: Flight controller.
-    """
+    """Raise FieldError for a policy whose commands the level or the firmware cannot fly."""
     if policy.commands == "velocity":
         return
     words = policy.commands.replace("_", " ")
@@ -133,14 +121,7 @@ def check_compensated(pilot: PilotSettings, policy: PolicyInfo, vehicle: Vehicle
 
 
 def check_goal_height(policy: PolicyInfo, goal: Goal, field: str, asked: object) -> None:
-    """Raise FieldError for a policy that is told the goal's height, and a goal that has none.
-
-    Args:
-        policy: What flies.
-        goal: Where to.
-        field: What says where the goal is.
-        asked: Its value.
-    """
+    """Raise FieldError, of `field`, for a policy that takes a height, and a goal without one."""
     if policy.card is not None and policy.card.observation.goal_height and len(goal) == 2:
         raise FieldError(
             field,
@@ -164,16 +145,10 @@ def check_quota(asked: Decisions, injection: Injection, level: LevelName) -> Non
 
 
 def select_latency(asked: Lateness, policy: PolicyInfo, *, on_this_computer: bool) -> Injection:
-    """Return the latency that a companion by itself flies with.
+    """Return the latency of a companion that runs alone.
 
-    Args:
-        asked: What was asked for.
-        policy: What flies.
-        on_this_computer: Whether it runs on the very computer that it flies as: what was measured
-            there is then no addition.
-
-    Raises:
-        UsageError: There is no such computer, workload or source.
+    `on_this_computer`: it runs on the very computer that it flies as, so that measured latencies
+    are no addition. Raises UsageError for an unknown computer, workload or source.
     """
     return select_injection(
         asked.latency,
@@ -185,17 +160,7 @@ def select_latency(asked: Lateness, policy: PolicyInfo, *, on_this_computer: boo
 
 
 def load_asked_policy(asked: Decisions, policy: PolicyInfo, hold_s: float, seed: int) -> Policy:
-    """Return the policy, ready to decide as asked.
-
-    Args:
-        asked: Runtime, threads, ablation, trust.
-        policy: What is known of it.
-        hold_s: How long each of its actions is held [s].
-        seed: Of its random actions.
-
-    Raises:
-        UsageError: It cannot be run as asked.
-    """
+    """Return the policy, ready to decide as configured, or raise UsageError."""
     return load_policy(
         policy,
         hold_s,

@@ -1,4 +1,4 @@
-"""From what was asked for to what is flown: every profile and the policy are read exactly once."""
+"""Resolve a scenario. Every profile and the policy are read exactly once."""
 
 from __future__ import annotations
 
@@ -38,13 +38,9 @@ from airl_mav.scenario.resolved import ResolvedScenario
 def resolve(scenario: Scenario, policy: PolicyInfo | None = None) -> ResolvedScenario:
     """Check all that can be wrong before anything starts, and load all that the scenario names.
 
-    Args:
-        scenario: What is asked for.
-        policy: What decides in place of the policy that the scenario names; None: that one.
-
-    Raises:
-        UsageError: A field contradicts another, a profile or the policy cannot be used, or no
-            arena can be made of the first seed. `FieldError`s name the field.
+    `policy` replaces the scenario's. Raises UsageError if a field contradicts another, a profile or
+    the policy cannot be used, or no arena can be made of the first seed. `FieldError`s name the
+    field.
     """
     check_level(scenario)
     if scenario.level != "gym":

@@ -61,7 +61,6 @@ class PlannedEpisode:
     """An episode to be flown."""
 
     index: int
-    """Its number in the run."""
     seed: int
 
 
@@ -70,7 +69,6 @@ class ResolvedScenario:
     """A scenario, checked, and the content of every profile that it names."""
 
     scenario: Scenario
-    """As it was asked for."""
     vehicle: VehicleProfile
     """With its computer and payload on board."""
     arena: ArenaSpec
@@ -98,7 +96,7 @@ class ResolvedScenario:
         """All that is written down of a run, as plain values.
 
         The scenario with absolute paths, and with what was left open decided, so that a default and
-        the same value asked for are one run; and the content of profiles and policy: a name does
+        the same value asked for are one run; and the content of profiles and policy. A name does
         not tell a changed one.
         """
         pilot = asdict(self.pilot)
@@ -168,7 +166,7 @@ class ResolvedScenario:
         """Return the arena of the episode of a seed. Raises UsageError if none can be made.
 
         Moving obstacles are where the seed's tours begin when navigation does, as nearly as that is
-        known beforehand: the same seed is the same scene at every level.
+        known beforehand. The same seed is the same scene at every level.
         """
         # Imported here: it takes scipy, which a companion has no need of.
         from airl_mav.arena.generate import generate
@@ -237,31 +235,22 @@ class ResolvedScenario:
         return Path(self.scenario.arena).stem
 
     def latency_sampler(self, seed: int, *, native: bool) -> LatencySampler | None:
-        """Return where the episode of a seed draws t2 from.
+        """Return the source of t2 of a seed's episode.
 
-        Args:
-            seed: Of the episode.
-            native: Whether the companion's own time counts: then None means that nothing is
-                injected; otherwise t2 is that of a desktop computer.
+        Where the companion's own time counts (`native`), None means that nothing is injected.
+        Otherwise t2 is that of a desktop computer.
         """
         sampler = self.injection.sampler(latency_generator(seed, self.scenario.latency_seed))
         return sampler if native else sampler or FixedSampler(NATIVE_T2_US)
 
     def compensator(self) -> Compensator | None:
-        """Return what carries forward what a companion sees, or None where nothing does.
-
-        Raises FieldError for a vehicle whose response is not known.
-        """
+        """Return the compensator of a companion, None without one. Raises FieldError."""
         if not self.pilot.compensate:
             return None
         return Compensator(1, self.vehicle, Intrinsics.of(self.vehicle.camera))
 
     def fresh_policy(self, seed: int) -> Policy:
-        """Return the policy as it begins the flight of a seed: it remembers nothing.
-
-        Raises:
-            UsageError: It cannot be run as asked.
-        """
+        """Return the policy at the start of a seed's flight, or raise UsageError."""
         loaded = self._loaded_policy
         if isinstance(loaded, LearnedPolicy):
             return loaded.with_generator(action_generator(seed))

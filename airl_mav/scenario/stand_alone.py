@@ -10,7 +10,7 @@ from pydantic import Field
 
 from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.errors import FieldError
-from airl_mav.core.fields import ProfileModel, quantity
+from airl_mav.core.fields import ProfileModel, optional, quantity, switch
 from airl_mav.core.goals import Goal
 from airl_mav.core.ports import LOOPBACK
 from airl_mav.faults.kinds import PROCESSES
@@ -67,34 +67,30 @@ class StandAloneVehicle(Aircraft):
     seed: int = quantity(
         "seed of arena, sensors, wind and spread", "1", ge=0, le=GREATEST_SEED, default=1
     )
-    speed: float | Literal["max"] | None = Field(
-        default=None,
-        description="simulated seconds per wall second, above 0, at most 100; max: as fast as it"
-        " goes, for clients that do not live by the wall clock; by default 1, in lockstep max",
+    speed: float | Literal["max"] | None = optional(
+        "simulated seconds per wall second, above 0, at most 100; max: as fast as it"
+        " goes, for clients that do not live by the wall clock; by default 1, in lockstep max"
     )
     duration: float | None = quantity(
         "end after this simulated time; by default on Ctrl-C", "s", ge=0, le=1e6, default=None
     )
-    firmware_log: Path | None = Field(
-        default=None,
-        description="with real firmware that is started here: what it prints goes to this file",
+    firmware_log: Path | None = optional(
+        "with real firmware that is started here: what it prints goes to this file"
     )
     bind: str = Field(default=LOOPBACK, description="IPv4 address that links and camera bind")
     companion_host: str = Field(
         default=LOOPBACK, description="IPv4 address of the companion computer"
     )
     gcs_host: str = Field(default=LOOPBACK, description="IPv4 address of the ground station")
-    insecure: bool = Field(
-        default=False,
-        description="allow addresses that other machines can reach without a signing key: MAVLink"
-        " has no other authentication",
+    insecure: bool = switch(
+        "allow addresses that other machines can reach without a signing key: MAVLink"
+        " has no other authentication"
     )
-    lockstep: bool = Field(
-        default=False,
-        description="simulated time waits for one companion that passes turns (airl-companion"
+    lockstep: bool = switch(
+        "simulated time waits for one companion that passes turns (airl-companion"
         " --lockstep, or any program that keeps to docs/reference/lockstep-protocol.md): the same"
         " flight every time, bit by bit; there is no ground station then, and the companion's end"
-        " ends the flight",
+        " ends the flight"
     )
     transport_ms: float = quantity(
         "in lockstep: from a frame's exposure until the companion sees it",
@@ -118,25 +114,22 @@ class StandAloneVehicle(Aircraft):
         le=3600,
         default=COMPANION_TIMEOUT_S,
     )
-    goal_radius_m: GoalRadius | None = Field(
-        default=None,
-        description="in lockstep: judge the flight, and tell the companion when it is lost; the"
+    goal_radius_m: GoalRadius | None = optional(
+        "in lockstep: judge the flight, and tell the companion when it is lost; the"
         " goal is reached closer than this: seen from above, if it has no height; by default"
-        " nobody judges",
+        " nobody judges"
     )
     time_limit_s: TimeLimit = Field(
         default=TIME_LIMIT_S,
         description="with a goal radius: longest flight from the start of navigation",
     )
-    parameters_file: Path | None = Field(
-        default=None,
-        description="keep the parameters that clients set in this file: read at the start, written"
-        " after every change; QGroundControl loads it, too",
+    parameters_file: Path | None = optional(
+        "keep the parameters that clients set in this file: read at the start, written"
+        " after every change; QGroundControl loads it, too"
     )
-    tlog: Path | None = Field(
-        default=None,
-        description="write the MAVLink log of the onboard link to this file, and the vehicle's log"
-        " (.ulg) beside it",
+    tlog: Path | None = optional(
+        "write the MAVLink log of the onboard link to this file, and the vehicle's log"
+        " (.ulg) beside it"
     )
 
     @property
@@ -176,10 +169,9 @@ class CompanionAddresses(ProfileModel):
 class StandAloneCompanion(CompanionAddresses, Lateness, Decisions):
     """What flies a policy, by itself: on an onboard computer, or against any simulator."""
 
-    signing_key: Path | None = Field(
-        default=None,
-        description="sign MAVLink with the key in this file, that of the flight controller (64"
-        " hexadecimal digits, mode 0600); over udpin:// only",
+    signing_key: Path | None = optional(
+        "sign MAVLink with the key in this file, that of the flight controller (64"
+        " hexadecimal digits, mode 0600); over udpin:// only"
     )
     policy: PolicyName = DEFAULT_POLICY
     goal: Goal = Field(
@@ -198,15 +190,13 @@ class StandAloneCompanion(CompanionAddresses, Lateness, Decisions):
         description="vehicle profile: its response to setpoints and its camera's mount are what"
         " compensation reckons with",
     )
-    check: bool = Field(
-        default=False,
-        description="look at camera, flight controller and policy on the ground, say what is wrong,"
-        " and end: nothing is armed, no setpoint is sent",
+    check: bool = switch(
+        "look at camera, flight controller and policy on the ground, say what is wrong,"
+        " and end: nothing is armed, no setpoint is sent"
     )
-    lockstep: bool = Field(
-        default=False,
-        description="take turns with a simulator that waits for this program (airl-firmware"
-        " --lockstep): every flight of a seed is the same",
+    lockstep: bool = switch(
+        "take turns with a simulator that waits for this program (airl-firmware"
+        " --lockstep): every flight of a seed is the same"
     )
     speed: float = quantity(
         "simulated seconds per wall second of the simulator; 1 on a real aircraft",
@@ -229,20 +219,16 @@ class StandAloneCompanion(CompanionAddresses, Lateness, Decisions):
         le=3600,
         default=30.0,
     )
-    log: Path | None = Field(
-        default=None, description="write the stamps of every decision to this .npz file"
-    )
-    black_box: Path | None = Field(
-        default=None,
-        description="record the flight in a new file of this folder, <UTC time>.mcap: decisions,"
+    log: Path | None = optional("write the stamps of every decision to this .npz file")
+    black_box: Path | None = optional(
+        "record the flight in a new file of this folder, <UTC time>.mcap: decisions,"
         " telemetry, images, status and resources; it survives a crash up to its last second, and"
-        " airl report shows it",
+        " airl report shows it"
     )
-    tell_obstacles: bool = Field(
-        default=False,
-        description="send OBSTACLE_DISTANCE from the depth camera, ten times a second, for the"
+    tell_obstacles: bool = switch(
+        "send OBSTACLE_DISTANCE from the depth camera, ten times a second, for the"
         " flight controller's collision prevention (CP_DIST), which holds back a pilot in Position"
-        " mode",
+        " mode"
     )
     black_box_images_hz: float = quantity(
         "most images that the black box keeps, each one that a decision saw",

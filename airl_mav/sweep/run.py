@@ -13,7 +13,7 @@ from pydantic import Field
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError
-from airl_mav.core.fields import quantity, validated
+from airl_mav.core.fields import optional, quantity, switch, validated
 from airl_mav.core.progress import Bar, Progress
 from airl_mav.experiments.executors import Executor, ExecutorSettings, Stop, WorkerError, never
 from airl_mav.experiments.store import open_campaign
@@ -36,9 +36,7 @@ class SweepRequest(Workers):
         description="quick (two cores, an hour), full (the paper's grid), paper (the same on the"
         " paper's image, for GPUs), tiny (seconds, shows nothing), or a path to a .toml",
     )
-    out: Path | None = Field(
-        default=None, description="folder of the sweep; by default runs/sweep-<name>"
-    )
+    out: Path | None = optional("folder of the sweep; by default runs/sweep-<name>")
     seeds: int | None = quantity(
         "training seeds of each cell, 1 to N; by default the sweep's",
         "1",
@@ -46,22 +44,17 @@ class SweepRequest(Workers):
         le=1000,
         default=None,
     )
-    steps: int | None = Field(
-        default=None, description="decisions of each training; by default the sweep's"
+    steps: int | None = optional("decisions of each training; by default the sweep's")
+    episodes: int | None = optional(
+        "flights that judge each trained network; by default the sweep's"
     )
-    episodes: int | None = Field(
-        default=None,
-        description="flights that judge each trained network; by default the sweep's",
+    seed: int | None = optional(
+        "seed of the first of these flights; flight i has seed + i, in every cell; by"
+        " default the sweep's"
     )
-    seed: int | None = Field(
-        default=None,
-        description="seed of the first of these flights; flight i has seed + i, in every cell; by"
-        " default the sweep's",
-    )
-    computer: str | None = Field(
-        default=None,
-        description="computer profile: each cell then shows its decision latency t2 there,"
-        " estimated from multiply-accumulates; may change when a sweep goes on",
+    computer: str | None = optional(
+        "computer profile: each cell then shows its decision latency t2 there,"
+        " estimated from multiply-accumulates; may change when a sweep goes on"
     )
     device: Literal["cpu", "cuda"] = Field(
         default="cpu", description="what trains: cpu, one core a trial, or cuda"
@@ -73,10 +66,9 @@ class SweepRequest(Workers):
         le=8,
         default=None,
     )
-    dry_run: bool = Field(
-        default=False,
-        description="say what would be done: trials, parameters, multiply-accumulates, decisions;"
-        " nothing is trained or written",
+    dry_run: bool = switch(
+        "say what would be done: trials, parameters, multiply-accumulates, decisions;"
+        " nothing is trained or written"
     )
 
     @property
@@ -159,21 +151,10 @@ def run_sweep(
 ) -> tuple[Sweep, str | None]:
     """Run the remaining trials; `sweep.json` is written after each.
 
-    Args:
-        path: The sweep's folder, new or to resume; all workers see it under this path.
-        config: The search space.
-        executor: Executor of the trainings.
-        command: The command line, for the records.
-        progress: Progress display.
-        device: cpu or cuda.
-        computer: Computer for latency estimates; None = none.
-        stop: Polled several times a second; True stops the sweep and keeps finished trials.
-
-    Returns:
-        The sweep so far, and the reason of an early end or None.
-
-    Raises:
-        UsageError: Invalid input, or the folder holds something else.
+    All workers see the folder, new or to resume, under this path. `stop` is polled several times a
+    second. True stops the sweep and keeps finished trials. Returns the sweep so far, and the reason
+    of an early end or None. Raises UsageError for invalid input, or if the folder holds something
+    else.
     """
     say = partial(progress.note, style="yellow")
     with open_campaign(path, declaration(config), command=command, say=say) as store:

@@ -16,11 +16,7 @@ from airl_mav.training.store import TrainingFolder, TrainingProgress
 
 
 def run_trial(folder: SweepFolder, trial: Trial, command: str, device: str) -> TrialResult:
-    """Run or resume a trial on cpu or cuda, and return its result, kept in the folder.
-
-    Raises:
-        UsageError: It cannot be trained, or another process is at it.
-    """
+    """Run or resume a trial on cpu or cuda; return its result. Raises UsageError."""
     config, path = training_of(folder.config, trial), folder.trial_path(trial)
     # Waits for a worker that is just being ended to let go of the trial.
     with locked(path, lambda _: None):

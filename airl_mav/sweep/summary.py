@@ -182,11 +182,7 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 
 def estimated_ms(computer: ComputerProfile, macs: int) -> float:
-    """Return a network's mean t2 [ms], scaled by MACs from the computer's nearest workload.
-
-    Raises:
-        UsageError: The computer has no workload.
-    """
+    """Return a network's mean t2 [ms] by MACs, or raise UsageError without workload."""
     latency = choose_injection(computer, ESTIMATE, macs=macs).latency
     if not isinstance(latency, Latency):
         raise UsageError("--computer: has no workload to estimate from")

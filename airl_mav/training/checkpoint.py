@@ -1,8 +1,8 @@
 """Checkpoints: everything that a training run needs to resume exactly.
 
-A checkpoint is a folder, written under another name, synced and renamed; then the file `latest`
+A checkpoint is a folder, written under another name, synced and renamed. Then the file `latest`
 names it, so that there is always a whole one. Save between two rollouts only (stable-baselines3's
-`on_rollout_start`): within one, part of the state is in local variables. Nothing is unpickled.
+`on_rollout_start`). Within one, part of the state is in local variables. Nothing is unpickled.
 """
 
 from __future__ import annotations
@@ -233,13 +233,7 @@ class DamagedError(Exception):
 
 
 def save_checkpoint(folder: Path, model: BaseAlgorithm, meta: Mapping[str, Any]) -> Path:
-    """Write a checkpoint and return its folder; only the previous one is kept.
-
-    Args:
-        folder: Folder of the run's checkpoints.
-        model: The learner between two rollouts; its environment is `Restorable`.
-        meta: JSON data for `load_latest`.
-    """
+    """Write a checkpoint with JSON data `meta`; return its folder. Keeps the previous one."""
     folder.mkdir(parents=True, exist_ok=True)
     for leftover in folder.glob(f"{PREFIX}*{PARTIAL}"):
         shutil.rmtree(leftover)
@@ -284,18 +278,9 @@ def load_latest(
 ) -> dict[str, Any] | None:
     """Restore a learner and its environment from the newest undamaged checkpoint.
 
-    Continue with `model.learn(total - model.num_timesteps, reset_num_timesteps=False)`.
-
-    Args:
-        folder: Folder of the run's checkpoints.
-        model: A learner of the same specification.
-        refused: Called with one line per damaged checkpoint.
-
-    Returns:
-        The saved `meta`; None without a checkpoint.
-
-    Raises:
-        UsageError: All are damaged, or of another specification.
+    Continue with `model.learn(total - model.num_timesteps, reset_num_timesteps=False)`. Returns the
+    saved `meta`, None without a checkpoint; `refused` receives a line per damaged one. Raises
+    UsageError if all are damaged, or of another specification.
     """
     damaged: list[Path] = []
     for path in _candidates(folder):

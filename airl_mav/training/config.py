@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, get_args
 from pydantic import Field, field_validator, model_validator
 
 from airl_mav.core.errors import FieldError
-from airl_mav.core.fields import ProfileModel, quantity, validated
+from airl_mav.core.fields import ProfileModel, optional, quantity, switch, validated
 from airl_mav.core.plugins import NETWORKS, part_name
 from airl_mav.envs.spec import EnvironmentSpec, ExpertName
 from airl_mav.policy.action_sets import SHIPPED, ActionSpec, discrete_actions
@@ -47,10 +47,9 @@ class NetworkSpec(ProfileModel):
     """
 
     kind: NetworkKind = Field(default="small", description="network")
-    strides: tuple[int, int, int, int] | None = Field(
-        default=None,
-        description="strides of the four convolutions of small and appendix; "
-        "left out: chosen by the height of the image",
+    strides: tuple[int, int, int, int] | None = optional(
+        "strides of the four convolutions of small and appendix; "
+        "left out: chosen by the height of the image"
     )
     layers: int | None = quantity(
         "convolutions, and dense layers, of a template", "1", ge=1, le=16, default=None
@@ -63,9 +62,8 @@ class NetworkSpec(ProfileModel):
         default=None,
     )
 
-    dense: tuple[Annotated[int, Field(ge=1, le=65536)], ...] | None = Field(
-        default=None,
-        description="units of each dense layer behind an extractor of your own; left out: 128, 128",
+    dense: tuple[Annotated[int, Field(ge=1, le=65536)], ...] | None = optional(
+        "units of each dense layer behind an extractor of your own; left out: 128, 128"
     )
     options: dict[str, Option] = Field(
         default_factory=dict, description="arguments of an extractor of your own"
@@ -220,17 +218,15 @@ class TrainingConfig(ProfileModel):
         "decisions of all vehicles together", "1", ge=1, le=10**10, default=100_000
     )
     vehicles: int = quantity("flights at a time", "1", ge=1, le=100_000, default=32)
-    initial: str | None = Field(
-        default=None,
-        description="folder of a training run whose best weights this one begins with; left out:"
-        " with fresh ones",
+    initial: str | None = optional(
+        "folder of a training run whose best weights this one begins with; left out:"
+        " with fresh ones"
     )
     checkpoint_every: int = quantity(
         "steps between checkpoints", "1", ge=1, le=10**9, default=20_000
     )
-    keep_zones: bool = Field(
-        default=False,
-        description="keep a checkpoint and the weights with which each curriculum zone was done",
+    keep_zones: bool = switch(
+        "keep a checkpoint and the weights with which each curriculum zone was done"
     )
     environment: EnvironmentSpec = Field(default_factory=EnvironmentSpec, description="environment")
     network: NetworkSpec = Field(default_factory=NetworkSpec, description="network")
@@ -258,18 +254,9 @@ def configured(
 ) -> TrainingConfig:
     """Return a configuration with some of its values changed.
 
-    Args:
-        config: Default values.
-        seed: Seed of weights, exploration and episodes.
-        steps: Decisions of all vehicles together.
-        computer: Profile whose latency applies; needs `workload`.
-        workload: Workload whose t2 is drawn in every decision.
-        latency: Sources of t2 instead of computer and workload.
-        sensing_distance_m: Sensing distance of the safe velocity [m].
-        initial: Training run whose best weights are the initial ones.
-
-    Raises:
-        UsageError: A value is out of range, or needs another one.
+    `steps` are decisions of all vehicles together. The latency t2 is drawn from a `workload` of the
+    `computer`, or from the sources `latency`. `initial` is the training run with the initial
+    weights. Raises UsageError if a value is out of range, or needs another one.
     """
     if computer is not None and workload is None:
         known = ", ".join(load_computer(computer).workloads)

@@ -49,14 +49,10 @@ class Batch(NamedTuple):
 
 
 class NStepReplay:
-    """The memory.
+    """Replay memory of `steps` transitions, in rows of `vehicles`.
 
-    Args:
-        steps: Capacity in transitions of all vehicles together.
-        vehicles: Vehicles per row.
-        shapes: Shape and type of each array of an observation.
-        n_step: Maximum rewards of a chain.
-        gamma: Discount of one step.
+    `shapes` has shape and type of each array of an observation. A chain has at most `n_step`
+    rewards.
     """
 
     def __init__(

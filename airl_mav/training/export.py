@@ -136,13 +136,8 @@ def network_of(
 ) -> nn.Module:
     """Return the deciding part of an SB3 or sb3-contrib model, for `export_network`.
 
-    Args:
-        model: The model.
-        keys: Keys of its layout's arrays, in order.
-        learned: The VecNormalize around its environment; None = none.
-
-    Raises:
-        UsageError: The policy's class is not supported.
+    `keys` are those of its layout's arrays, in order, `learned` is the VecNormalize around its
+    environment. Raises UsageError if the policy's class is not supported.
     """
     policy: Any = model.policy
     keys = tuple(keys)
@@ -200,10 +195,7 @@ def check_spaces(
     actions: action_sets.ActionSpec,
     normalised: Collection[str] = (),
 ) -> None:
-    """Raise UsageError unless a model takes a layout's arrays and gives an action set.
-
-    Arrays of `normalised` keys were floats in training.
-    """
+    """Raise UsageError unless a model takes a layout's arrays and gives an action set."""
     seen = model.observation_space
     wanted = {key: (box.shape, box.dtype) for key, box in boxes(spec).items()}
     accepted = ", ".join(f"{k} {np.dtype(kind)} {shape}" for k, (shape, kind) in wanted.items())
@@ -247,15 +239,9 @@ def check_spaces(
 def export(asked: export_request.ExportRequest, command: str) -> PolicyCard:
     """Export the .zip of an SB3 model, or a plain module, as a policy that flies; return its card.
 
-    A .zip holds pickled Python objects and a module is code: export only from people you trust.
-
-    Args:
-        asked: Model, folder and card data beyond the network.
-        command: Command line for the card.
-
-    Raises:
-        UsageError: The model cannot be loaded or exported or does not fit its description, or the
-            folder is not writable. Nothing usable was written.
+    A .zip holds pickled Python objects and a module is code. Export only from people you trust.
+    Raises UsageError if the model cannot be loaded or exported or does not fit its description, or
+    the folder is not writable. Then nothing usable was written.
     """
     out = asked.out
     if out.exists() and not out.is_dir():
@@ -301,15 +287,10 @@ def taken_by(model: BaseAlgorithm) -> export_request.Taken:
 
 
 def load_module(name: str, weights: Path | None, keys: Sequence[str] = USUAL) -> nn.Module:
-    """Return a user's module for `export_network`.
+    """Return a user's module for `export_network`, named as in `core.plugins`.
 
-    Args:
-        name: Module, class or factory, named as in `core.plugins`.
-        weights: Its `state_dict` as of `torch.save`; None = included.
-        keys: Keys of its layout's arrays, in order.
-
-    Raises:
-        UsageError: It cannot be made, or the weights do not fit.
+    `weights` are its `state_dict` as of `torch.save`; None = included. Raises UsageError if it
+    cannot be made, or the weights do not fit.
     """
     found = load_part(MODELS, name)
     try:
@@ -355,17 +336,10 @@ def export_sb3(
     with_torch: bool = False,
     learned: VecNormalize | None = None,
 ) -> PolicyCard:
-    """Write a model as `policy.onnx` with its card, and return the card.
+    """Write a model of SB3 or sb3-contrib as `policy.onnx` with its card, and return the card.
 
-    Args:
-        model: Any SB3 or sb3-contrib algorithm.
-        facts: Card data beyond the network.
-        folder: Output folder.
-        with_torch: Also write a torch program.
-        learned: The VecNormalize around its environment, exported with the network; None = none.
-
-    Raises:
-        UsageError: The model's spaces do not fit the facts, or it cannot be exported.
+    `learned` is the VecNormalize around its environment, exported with the network. Raises
+    UsageError if the model's spaces do not fit the facts, or it cannot be exported.
     """
     check_spaces(model, facts.observation, facts.actions, export_request.normalised_keys(learned))
     network = network_of(model, tuple(boxes(facts.observation)), learned)

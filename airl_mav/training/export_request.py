@@ -15,7 +15,7 @@ from torch import nn
 
 from airl_mav.core.clock import utc_now
 from airl_mav.core.errors import FieldError
-from airl_mav.core.fields import validated
+from airl_mav.core.fields import optional, switch, validated
 from airl_mav.core.plugins import names_code
 from airl_mav.core.provenance import package_versions
 from airl_mav.envs.sight import further_seen
@@ -26,10 +26,9 @@ from airl_mav.policy.actions import DecisionTiming
 from airl_mav.policy.card import PolicyFacts, Training
 from airl_mav.policy.observation_spec import LayoutName, ObservationSpec
 from airl_mav.policy.runtime import first_line
-from airl_mav.profiles.camera_kind import CameraKind
+from airl_mav.profiles.camera_kind import CameraKind, Projection
 from airl_mav.profiles.distortion import UNDISTORTED
 from airl_mav.profiles.loading import load_profile
-from airl_mav.profiles.projection import Projection
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.model import PilotSettings
 
@@ -140,115 +139,84 @@ class ExportRequest(BaseModel):
         " function that makes one, as MODULE:NAME or FILE.py:NAME; or a policy, by its name or"
         " folder, to be written in integers, or to fly otherwise"
     )
-    algorithm: str | None = Field(
-        default=None,
-        description="class that wrote a .zip, of stable-baselines3 or sb3-contrib: DQN, PPO, A2C,"
-        " ...; of a module of your own only a note on the card",
+    algorithm: str | None = optional(
+        "class that wrote a .zip, of stable-baselines3 or sb3-contrib: DQN, PPO, A2C,"
+        " ...; of a module of your own only a note on the card"
     )
-    weights: Path | None = Field(
-        default=None, description="state_dict of a module of your own, as torch.save wrote it"
+    weights: Path | None = optional("state_dict of a module of your own, as torch.save wrote it")
+    vec_normalize: Path | None = optional(
+        "what the `save` of the VecNormalize around the training environment wrote, for"
+        " a .zip: its statistics become part of the network"
     )
-    vec_normalize: Path | None = Field(
-        default=None,
-        description="what the `save` of the VecNormalize around the training environment wrote, for"
-        " a .zip: its statistics become part of the network",
-    )
-    like: str | None = Field(
-        default=None,
-        description="training configuration whose environment the model was made for, a shipped"
-        " name or a path to a .toml: says all that follows and is left out",
+    like: str | None = optional(
+        "training configuration whose environment the model was made for, a shipped"
+        " name or a path to a .toml: says all that follows and is left out"
     )
     out: Path = Field(description="folder to write policy.onnx and card.json to")
-    name: str | None = Field(
-        default=None, description="short name of the policy; by default that of the folder"
-    )
+    name: str | None = optional("short name of the policy; by default that of the folder")
     description: str = Field(default="", description="one line about the policy")
-    layout: LayoutName | None = Field(
-        default=None,
-        description="observation layout that the model was trained with; by default body",
+    layout: LayoutName | None = optional(
+        "observation layout that the model was trained with; by default body"
     )
-    image: str | None = Field(
-        default=None,
-        description="width x height of the image that the network sees, px; `paper`: with its"
-        " strip; by default as the .zip says, or 32x24",
+    image: str | None = optional(
+        "width x height of the image that the network sees, px; `paper`: with its"
+        " strip; by default as the .zip says, or 32x24"
     )
-    frames: int | None = Field(
-        default=None,
-        description="images that the network sees, of this decision and those before it; by default"
-        " as the .zip says, or 1",
+    frames: int | None = optional(
+        "images that the network sees, of this decision and those before it; by default"
+        " as the .zip says, or 1"
     )
-    kind: CameraKind | None = Field(
-        default=None,
-        description="what the camera gives: depth, rgb or grey; by default as the .zip says, or"
-        " depth",
+    kind: CameraKind | None = optional(
+        "what the camera gives: depth, rgb or grey; by default as the .zip says, or depth"
     )
-    projection: Projection | None = Field(
-        default=None,
-        description="the camera's: pinhole, cylindrical or fisheye; by default pinhole",
+    projection: Projection | None = optional(
+        "the camera's: pinhole, cylindrical or fisheye; by default pinhole"
     )
-    horizontal_fov_deg: float | None = Field(
-        default=None, description="horizontal field of view of the camera, deg; by default 90"
+    horizontal_fov_deg: float | None = optional(
+        "horizontal field of view of the camera, deg; by default 90"
     )
-    range_m: float | None = Field(
-        default=None, description="depth from which on everything looks far, m; by default 20"
+    range_m: float | None = optional("depth from which on everything looks far, m; by default 20")
+    goal_height: bool | None = optional(
+        "whether the model is told how far the goal lies below the vehicle; by default"
+        " as the .zip says, or not"
     )
-    goal_height: bool | None = Field(
-        default=None,
-        description="whether the model is told how far the goal lies below the vehicle; by default"
-        " as the .zip says, or not",
-    )
-    actions: ActionSetName | None = Field(
-        default=None,
-        description="action set that the model was trained with: arc-25, paper-25, velocity,"
+    actions: ActionSetName | None = optional(
+        "action set that the model was trained with: arc-25, paper-25, velocity,"
         " velocity-fixed-yaw, arc3d-75, velocity3d, velocity3d-fixed-yaw, body-rates, or your own"
         " as MODULE:NAME or FILE.py:NAME; by default arc-25, or velocity where a .zip has"
-        " continuous actions, velocity3d where they are three, body-rates where they are four",
+        " continuous actions, velocity3d where they are three, body-rates where they are four"
     )
-    max_speed_m_s: float | None = Field(
-        default=None, description=f"fastest action, m/s; by default {PAPER_SPEED_M_S:g}"
+    max_speed_m_s: float | None = optional(f"fastest action, m/s; by default {PAPER_SPEED_M_S:g}")
+    max_rate_deg_s: float | None = optional(
+        f"greatest body rate of body-rates, deg/s; by default {MAX_RATE_DEG_S:g}"
     )
-    max_rate_deg_s: float | None = Field(
-        default=None,
-        description=f"greatest body rate of body-rates, deg/s; by default {MAX_RATE_DEG_S:g}",
+    hold_s: float | None = optional(
+        "t3: how long an action is held before the next observation, s; by default"
+        f" {PilotSettings.hold_s:g}"
     )
-    hold_s: float | None = Field(
-        default=None,
-        description="t3: how long an action is held before the next observation, s; by default"
-        f" {PilotSettings.hold_s:g}",
+    goal_radius_m: float | None = optional(f"radius of the goal, m; by default {GOAL_RADIUS_M:g}")
+    altitude_m: float | None = optional(
+        f"height above the start that is flown, m; by default {PilotSettings.altitude_m:g}"
     )
-    goal_radius_m: float | None = Field(
-        default=None, description=f"radius of the goal, m; by default {GOAL_RADIUS_M:g}"
+    hover_after_s: float | None = optional(
+        "age of a command at which the vehicle hovered in training, s; by default the"
+        " last one flew on"
     )
-    altitude_m: float | None = Field(
-        default=None,
-        description="height above the start that is flown, m; by default"
-        f" {PilotSettings.altitude_m:g}",
+    decision_timeout_s: float | None = optional(
+        "time since the last action after which a decision was overdue in training, s;"
+        " by default as the companion has it"
     )
-    hover_after_s: float | None = Field(
-        default=None,
-        description="age of a command at which the vehicle hovered in training, s; by default the"
-        " last one flew on",
-    )
-    decision_timeout_s: float | None = Field(
-        default=None,
-        description="time since the last action after which a decision was overdue in training, s;"
-        " by default as the companion has it",
-    )
-    decisions: DecisionTiming | None = Field(
-        default=None,
-        description="when a decision begins: sequential, after the hold of the one before, or"
-        " pipelined, with the newest frame; by default sequential",
+    decisions: DecisionTiming | None = optional(
+        "when a decision begins: sequential, after the hold of the one before, or"
+        " pipelined, with the newest frame; by default sequential"
     )
     epsilon: float = Field(
         default=0.0,
         description="share of random actions in flight, 0 to 1; discrete action sets only",
     )
-    with_torch: bool = Field(
-        default=False, description="also write policy.pt2, for the torch runtime"
-    )
-    int8: bool = Field(
-        default=False,
-        description="write a network in 8-bit integers, calibrated with frames of its own flights",
+    with_torch: bool = switch("also write policy.pt2, for the torch runtime")
+    int8: bool = switch(
+        "write a network in 8-bit integers, calibrated with frames of its own flights"
     )
 
     @property
@@ -262,15 +230,7 @@ class ExportRequest(BaseModel):
         return names_code(self.model)
 
     def facts(self, command: str, taken: Taken | None = None) -> PolicyFacts:
-        """Return the card data.
-
-        Args:
-            command: Command line of the export.
-            taken: Data from the loaded model.
-
-        Raises:
-            UsageError: A field is missing, contradicts another or is out of range.
-        """
+        """Return the card data, `taken` from the loaded model; UsageError for a wrong field."""
         if self.algorithm is None and not self.own_module:
             raise FieldError("algorithm", accepted="the class that wrote the .zip: DQN, PPO, ...")
         if self.weights is not None and not self.own_module:

@@ -91,11 +91,11 @@ class Demonstrations:
 
 
 class Imitation(BaseAlgorithm):
-    """Learns what an expert does, on the networks of PPO; their value is not learned.
+    """Learns what an expert does, on the networks of PPO. Their value is not learned.
 
     Intervals count steps of single vehicles. One generator draws who flies and what is learned
     from, so that a run can be resumed exactly. `env` is a `NavigationVecEnv`, which the expert
-    looks into; the other arguments are those of `config.AlgorithmSpec`, its options and
+    looks into. The other arguments are those of `config.AlgorithmSpec`, its options and
     stable-baselines3's base class.
     """
 

@@ -92,10 +92,8 @@ def export_network(
     attribute `state` (`recurrent.RecurrentNetwork`).
 
     Nothing is written unless ONNX Runtime and torch agree. After a kill there is no card, or an old
-    card that rejects the new policy: never a card for the wrong one.
-
-    Raises:
-        UsageError: The network does not fit the facts, cannot be exported, or the export differs.
+    card that rejects the new policy: never a card for the wrong one. Raises UsageError if the
+    network does not fit the facts, cannot be exported, or the export differs.
     """
     spec, state = facts.observation, memory_of(module)
     rng = np.random.default_rng(0)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, ClassVar
 from pydantic import BaseModel, Field
 
 from airl_mav.core.errors import FieldError, UsageError
+from airl_mav.core.fields import optional, switch
 from airl_mav.core.progress import Event, Progress
 from airl_mav.profiles.loading import load_profile
 from airl_mav.training.store import Evaluation, TrainingProgress
@@ -24,49 +25,37 @@ class TrainRequest(BaseModel):
         default="static-obstacles",
         description="training configuration: a shipped name, or a path to a .toml",
     )
-    out: Path | None = Field(
-        default=None, description="folder of the run; by default runs/train-<config>"
+    out: Path | None = optional("folder of the run; by default runs/train-<config>")
+    seed: int | None = optional(
+        "seed of weights, exploration and episodes; by default the configuration's"
     )
-    seed: int | None = Field(
-        default=None,
-        description="seed of weights, exploration and episodes; by default the configuration's",
+    computer: str | None = optional(
+        "decide as late as this computer in training: a shipped profile, or a path to a"
+        " .toml; takes --workload; by default the configuration's"
     )
-    computer: str | None = Field(
-        default=None,
-        description="decide as late as this computer in training: a shipped profile, or a path to a"
-        " .toml; takes --workload; by default the configuration's",
-    )
-    workload: str | None = Field(
-        default=None,
-        description="workload of that computer whose latency t2 is drawn in every decision",
+    workload: str | None = optional(
+        "workload of that computer whose latency t2 is drawn in every decision"
     )
     latency: tuple[str, ...] = Field(
         default=(),
         description="sources of t2 in place of computer and workload, as airl evaluate takes them:"
         " 150ms, lognormal:396ms,20ms, COMPUTER/WORKLOAD, FILE; of several, each episode draws one",
     )
-    sensing_distance_m: float | None = Field(
-        default=None,
-        description="scale the actions to the safe velocity: the vehicle, deciding as late as its"
+    sensing_distance_m: float | None = optional(
+        "scale the actions to the safe velocity: the vehicle, deciding as late as its"
         " longest latency, stops for what its camera sees so many metres off; by default the"
-        " configuration's, or not",
+        " configuration's, or not"
     )
-    steps: int | None = Field(
-        default=None,
-        description="decisions of all vehicles together; by default the configuration's",
+    steps: int | None = optional(
+        "decisions of all vehicles together; by default the configuration's"
     )
-    initial: str | None = Field(
-        default=None,
-        description="begin with the best weights of the training run in this folder; by default"
-        " the configuration's, or with fresh ones",
+    initial: str | None = optional(
+        "begin with the best weights of the training run in this folder; by default"
+        " the configuration's, or with fresh ones"
     )
-    name: str | None = Field(
-        default=None, description="name of the policy on its card; by default the configuration's"
-    )
-    resume: bool = Field(
-        default=False,
-        description="continue the run in --out from its newest checkpoint; start it if there is"
-        " none",
+    name: str | None = optional("name of the policy on its card; by default the configuration's")
+    resume: bool = switch(
+        "continue the run in --out from its newest checkpoint; start it if there is none"
     )
 
     @property
@@ -124,7 +113,6 @@ class Exported(Event):
 
     event: ClassVar[str] = "policy"
     path: str
-    """Folder of the policy, for `--policy`."""
 
 
 class TrainingBar(TrainingProgress):

@@ -49,15 +49,11 @@ from airl_mav.view.ends import ViewEnds
 
 
 def begin_with(model: BaseAlgorithm, run: Path, log_std: float | None = None) -> None:
-    """Load the best weights of a training run, value and exploration included; reset the optimiser.
+    """Load the best weights of a training run, value and exploration too; reset the optimiser.
 
-    Args:
-        model: A learner of the same algorithm, inputs, network and actions.
-        run: Folder of an evaluated training run.
-        log_std: Initial log standard deviation of continuous actions; None = the run's.
-
-    Raises:
-        UsageError: No such run, not evaluated yet, or the weights do not fit.
+    The run was evaluated, and the learner has the same algorithm, inputs, network and actions.
+    `log_std` is the initial log standard deviation of continuous actions; None = the run's. Raises
+    UsageError for another run, or if the weights do not fit.
     """
     folder = TrainingFolder(run)
     learned = folder.about()["config"]["algorithm"]["name"]
@@ -89,9 +85,7 @@ class TrainingResult(NamedTuple):
 
     folder: TrainingFolder
     best: Evaluation
-    """The evaluation of the exported weights."""
     card: PolicyCard
-    """Card of the policy in `folder.policy`."""
 
 
 def nominal(spec: EnvironmentSpec) -> EnvironmentSpec:
@@ -112,18 +106,8 @@ def train(
 ) -> TrainingResult:
     """Train a policy to the end and export its best weights.
 
-    Args:
-        config: The configuration; the safe velocity may bound its fastest action.
-        out: Folder of the run.
-        name: Name of the policy on its card.
-        resume: Resume the run in `out` from its newest checkpoint, if any.
-        progress: Receives the progress.
-        device: torch device of the learner.
-        command: Command line for the card.
-        view: Live view; does not change the weights.
-
-    Returns:
-        The run's folder, the best evaluation and the policy's card.
+    `resume` continues the run in `out` from its newest checkpoint, if any. The live view does not
+    change the weights. Returns the run's folder, the best evaluation and the policy's card.
 
     Raises:
         UsageError: Unusable profile or algorithm, `out` is in use or holds another run, or the
@@ -149,10 +133,7 @@ def train(
 
 
 def check_trainable(config: TrainingConfig, name: str, device: str = "cpu") -> None:
-    """Raise UsageError where a training could not begin or its network not be exported.
-
-    Custom code is exported once as a test, which takes seconds.
-    """
+    """Raise UsageError if a training could not begin, or custom code not be exported."""
     env = environment_of(config)
     check_actions(config.algorithm.name, kind_of(config.environment.actions))
     model = learner_of(config, env, device)
@@ -187,9 +168,8 @@ def fit(
 ) -> Evaluation:
     """Train in a locked folder from the newest checkpoint; return the best weights' evaluation.
 
-    Raises:
-        UsageError: The algorithm does not fit the environment, an arena cannot be made, or initial
-            weights are missing.
+    Raises UsageError if the algorithm does not fit the environment, an arena cannot be made, or
+    initial weights are missing.
     """
     check_actions(config.algorithm.name, kind_of(config.environment.actions))
     env = environment_of(config, watcher)

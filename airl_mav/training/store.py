@@ -64,12 +64,10 @@ class TrainingProgress:
         """Called when another process has the folder; it is waited for."""
 
     def trained(self, steps: int, success: float | None, zone: int | None) -> None:
-        """Called after each step of all vehicles.
+        """Called after each step of all vehicles, with their decisions so far.
 
-        Args:
-            steps: Decisions of all vehicles so far.
-            success: Success rate of the newest episodes; None before the first.
-            zone: Open curriculum zone; None without a curriculum.
+        `success` is the rate of the newest episodes, None before the first; `zone` is the open
+        curriculum zone.
         """
 
     def evaluated(self, evaluation: Evaluation, *, best: bool) -> None:
@@ -88,7 +86,6 @@ class TrainingFolder:
         """The best weights so far, as stable-baselines3 saves them."""
         self.zones = path / "zones"
         self.policy = path / "policy"
-        """The exported result."""
 
     @classmethod
     def begin(

@@ -1,6 +1,6 @@
 """View of a training: the newest episode of its first vehicle, flown again.
 
-Training only records that vehicle's seeds and actions; flights do not depend on others beside them,
+Training only records that vehicle's seeds and actions. Flights do not depend on others beside them,
 so a separate thread repeats them at the viewers' pace, skipping some. Learning is not affected.
 """
 

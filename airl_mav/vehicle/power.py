@@ -1,7 +1,8 @@
 """Electrical power of the aircraft: momentum theory from the rotor's own data, or a regression.
 
 One kernel for plant and batch twin. Both models give the aircraft's own power, its flight
-controller included; the onboard computer's watts come beside it.
+controller included. The onboard computer's watts come beside it.
+The battery is a coulomb counter behind an open-circuit voltage and an internal resistance.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from airl_mav.core.constants import AIR_DENSITY_KG_M3, G_PER_KG, GRAVITY_M_S2
+from airl_mav.core.constants import AIR_DENSITY_KG_M3, C_PER_MAH, G_PER_KG, GRAVITY_M_S2
 from airl_mav.core.frames import Vector
 from airl_mav.core.kernels import kernel
 from airl_mav.profiles.vehicle import CORNERS, VehicleProfile
@@ -109,10 +110,8 @@ def induced_velocity(ideal2: float, in_plane2: float, climb: float) -> float:
     with the three velocities at right angles to each other. Exact in a hover, and to 4e-4 up to a
     climb of two and an advance of five times v_h, which leaves 2e-4 of the power.
 
-    Args:
-        ideal2: v_h², the square of the induced velocity in a hover, T / (2 rho A), > 0 [m²/s²].
-        in_plane2: Square of the velocity in the plane of the discs against the air [m²/s²].
-        climb: V_c, velocity against the air along the thrust, >= 0 [m/s].
+    `ideal2` is v_h² = T / (2 rho A) > 0, of a hover, `in_plane2` the square of the velocity in the
+    plane of the discs against the air [m²/s²], `climb` V_c, that along the thrust, >= 0 [m/s].
     """
     v = ideal2 / math.sqrt(in_plane2 + climb * climb + ideal2)
     # Of f(v) = v sqrt(V_inplane² + (V_c + v)²) - v_h²: f, f' and f'', each times the root.
@@ -130,20 +129,16 @@ def momentum_power_w(
 ) -> float:
     """Return the power by momentum theory [W].
 
-    P = [kappa T v_i + P0 (1 + 4.65 mu²) + T max(V_c, 0)] / eta + P_avionics with
-    P0 = (1/FM - kappa) T v_h, so that a hover takes T^1.5 / sqrt(2 rho A) / FM / eta. The body's
-    drag is in T V_c: a vehicle that flies level leans its thrust against it.
+    P = [kappa T v_i + P0 (1 + 4.65 mu²) + T max(V_c, 0)] / eta + P_avionics with P0 = (1/FM -
+    kappa) T v_h. So a hover takes T^1.5 / sqrt(2 rho A) / FM / eta. The body's drag is in T V_c: a
+    vehicle that flies level leans its thrust against it.
 
-    A negative V_c counts as 0: momentum theory does not hold from a hover down to twice the
-    induced velocity, where the rotors fly in their own wake, and a descent measured on a 3DR Solo
-    saved 10 % (discuss.ardupilot.org, thread 32200).
+    A negative V_c counts as 0. Momentum theory does not hold from a hover down to twice the induced
+    velocity. There the rotors fly in their own wake. A descent measured on a 3DR Solo saved 10 %
+    (discuss.ardupilot.org, thread 32200).
 
-    Args:
-        thrust: T, of all rotors [N].
-        thrust_max: Of one rotor at full command [N]; its speed follows from it.
-        in_plane2: Square of the velocity in the plane of the discs against the air [m²/s²].
-        climb: V_c, velocity against the air along the thrust [m/s].
-        m: The model.
+    `thrust` is T, of all rotors [N]. The speed of a rotor follows from its `thrust_max`.
+    `in_plane2` and `climb`, V_c, are as of `induced_velocity`.
     """
     if thrust < LEAST_THRUST_N:
         return m.avionics_w
@@ -160,14 +155,9 @@ def momentum_power_w(
 def regression_power_w(velocity: Vec, acceleration: Vec, wind: Vec, m: PowerModel) -> float:
     """Return the power by the nine coefficients [W], never below 0.
 
-    P = b1 |vxy| + b2 |axy| + b3 |vxy||axy| + b4 |vz| + b5 |az| + b6 |vz||az| + b7 m
-    + b8 vxy.w + b9 (Krishnan et al. 2021, eq. 1, after Tseng et al., arXiv 1703.10049).
-
-    Args:
-        velocity: NED [m/s].
-        acceleration: NED, gravity removed, low-passed as `felt` does it [m/s²].
-        wind: NED [m/s].
-        m: The model.
+    P = b1 |vxy| + b2 |axy| + b3 |vxy||axy| + b4 |vz| + b5 |az| + b6 |vz||az| + b7 m + b8 vxy.w + b9
+    (Krishnan et al. 2021, eq. 1, after Tseng et al., arXiv 1703.10049). All vectors are NED; the
+    acceleration is without gravity, low-passed by `felt`.
     """
     vxy = math.sqrt(velocity[0] * velocity[0] + velocity[1] * velocity[1])
     axy = math.sqrt(acceleration[0] * acceleration[0] + acceleration[1] * acceleration[1])
@@ -190,13 +180,9 @@ def felt_share(m: PowerModel, dt: float) -> float:
 def felt(before: Vec, velocity: Vec, newer: Vec, kept: float, dt: float, m: PowerModel) -> Vec:
     """Return the acceleration that a regression goes by: a first-order low-pass, NED [m/s²].
 
-    Args:
-        before: What it was before the tick [m/s²].
-        velocity: Before the tick, NED [m/s].
-        newer: After it.
-        kept: `felt_share`: the same at every tick.
-        dt: Length of the tick [s].
-        m: The model; momentum theory needs no acceleration, and `before` comes back.
+    `before` is its value before the tick of dt [s], `velocity` and `newer` are the velocities
+    before and after it, `kept` is `felt_share`. Momentum theory needs no acceleration, and `before`
+    comes back.
     """
     if m.momentum != 0.0:
         return before
@@ -220,16 +206,8 @@ def flight_power_w(
 ) -> float:
     """Return the power over a tick of flight [W], without the onboard computer's.
 
-    Velocity, attitude and acceleration are those at the start of the tick, in which its forces act.
-
-    Args:
-        thrust: Of all rotors [N].
-        velocity: NED [m/s].
-        q: Attitude body -> NED.
-        wind: NED [m/s].
-        acceleration: As `felt` returns it, NED [m/s²].
-        airframe: The vehicle.
-        m: Its power model.
+    Velocity, attitude (body -> NED) and acceleration (by `felt`) are those at the start of the
+    tick, in which its forces act; `thrust` is that of all rotors [N].
     """
     if m.momentum == 0.0:
         return regression_power_w(velocity, acceleration, wind, m)
@@ -248,7 +226,7 @@ def flight_power_w(
 def standing_power_w(thrust: float, airframe: Airframe, m: PowerModel) -> float:
     """Return the power of a vehicle that touches something [W]: that of its thrust at rest.
 
-    A regression is one of flight, and an impact is no electrical load: its hover is scaled by
+    A regression is one of flight, and an impact is no electrical load. Its hover is scaled by
     T^1.5, as momentum theory has it.
     """
     if m.momentum != 0.0:
@@ -269,3 +247,25 @@ def level_power_w(speed: float, airframe: Airframe, m: PowerModel) -> float:
     climb = speed * drag / thrust
     in_plane = speed * weight / thrust
     return momentum_power_w(thrust, airframe.thrust_max, in_plane * in_plane, climb, m)
+
+
+@kernel
+def terminal_voltage(open_circuit_v: float, resistance_ohm: float, power: float) -> float:
+    """Return the voltage under a constant-power load [W]: V = E - R P / V, upper root.
+
+    Above the greatest power that the pack can deliver, E²/4R, the voltage at that power: E/2.
+    """
+    discriminant = open_circuit_v * open_circuit_v - 4.0 * resistance_ohm * power
+    return 0.5 * (open_circuit_v + math.sqrt(max(0.0, discriminant)))
+
+
+@kernel
+def open_circuit(remaining: float, empty_v: float, full_v: float) -> float:
+    """Return the open-circuit voltage, linear in the state of charge 0..1."""
+    return empty_v + (full_v - empty_v) * remaining
+
+
+@kernel
+def drain(remaining: float, current_a: float, capacity_mah: float, dt: float) -> float:
+    """Return the state of charge after dt [s] at a current [A], not below 0."""
+    return max(0.0, remaining - current_a * (dt / (capacity_mah * C_PER_MAH)))

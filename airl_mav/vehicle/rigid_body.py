@@ -27,19 +27,9 @@ def drag_force(velocity: Vec, wind: Vec, airframe: Airframe) -> Vec:
 def accelerate(
     velocity: Vec, q: Quat, omega: Vec, force: Vec, torque: Vec, airframe: Airframe, dt: float
 ) -> tuple[Vec, Vec]:
-    """Return the velocities of a free body after dt [s].
+    """Return the velocities [m/s, rad/s] of a free body after dt [s], both NED.
 
-    Args:
-        velocity: NED [m/s].
-        q: Attitude body -> world.
-        omega: Angular velocity FRD [rad/s].
-        force: All forces but gravity, NED [N].
-        torque: FRD [N m].
-        airframe: Mass and inertia.
-        dt: Step [s].
-
-    Returns:
-        Velocity [m/s] and angular velocity [rad/s], both NED.
+    q is body -> NED, omega FRD; `force` is all but gravity, NED [N], `torque` FRD [N m].
     """
     m = airframe.mass
     vx = velocity[0] + force[0] / m * dt
@@ -57,17 +47,9 @@ def accelerate(
 
 @kernel
 def drift(position: Vec, velocity: Vec, q: Quat, spin: Vec, dt: float) -> tuple[Vec, Quat, Vec]:
-    """Move a body by dt [s] at constant velocities.
+    """Move a body by dt [s] at constant velocities; `spin` is the angular velocity NED.
 
-    Args:
-        position: NED [m].
-        velocity: NED [m/s].
-        q: Attitude body -> world.
-        spin: Angular velocity NED [rad/s].
-        dt: Step [s].
-
-    Returns:
-        Position NED [m], attitude, angular velocity FRD [rad/s] after the step.
+    Returns position, attitude and angular velocity FRD [rad/s].
     """
     dq = exponential((spin[0] * dt, spin[1] * dt, spin[2] * dt))
     q_new = normalize(multiply(dq, q))
@@ -91,21 +73,7 @@ def step(
     airframe: Airframe,
     dt: float,
 ) -> tuple[Vec, Vec, Quat, Vec]:
-    """Advance a free body by dt [s].
-
-    Args:
-        position: NED [m].
-        velocity: NED [m/s].
-        q: Attitude body -> world.
-        omega: Angular velocity FRD [rad/s].
-        force: All forces but gravity, NED [N].
-        torque: FRD [N m].
-        airframe: Mass and inertia.
-        dt: Step [s].
-
-    Returns:
-        Position, velocity, attitude, angular velocity after the step.
-    """
+    """Advance a free body by dt [s]; arguments as of `accelerate`, angular velocities FRD."""
     v, spin = accelerate(velocity, q, omega, force, torque, airframe, dt)
     p, q_new, body = drift(position, v, q, spin, dt)
     return p, v, q_new, body

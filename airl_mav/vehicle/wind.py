@@ -45,13 +45,7 @@ class Wind:
     def __init__(
         self, settings: WindSettings, rng: np.random.Generator, tick_s: float = TICK_S
     ) -> None:
-        """Begin an episode.
-
-        Args:
-            settings: As `wind_of_episode` returns them.
-            rng: Of the gusts.
-            tick_s: Length of a tick [s].
-        """
+        """Begin an episode; settings are those of `wind_of_episode`, `rng` is the gusts'."""
         self.steady = np.array([settings.north_m_s, settings.east_m_s, 0.0])
         """(3,) NED [m/s]."""
         sigma = settings.gust_m_s * np.array([1.0, 1.0, 0.5])

@@ -8,13 +8,14 @@ from typing import Any, NamedTuple
 
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import (
+    HOME,
+    MAGNETIC_DECLINATION,
     Geodetic,
     Vector,
     local_to_geodetic,
     quat_from_euler,
 )
 from airl_mav.core.kernels import kernel
-from airl_mav.core.location import HOME, MAGNETIC_DECLINATION
 from airl_mav.vehicle.atmosphere import altitude_m
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.magnetic_field import FieldCheck

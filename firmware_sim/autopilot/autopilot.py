@@ -145,7 +145,7 @@ class BuiltinAutopilot:
         )
         self._snapshot: AutopilotState | None = None
         self.failures: Failures | None = None
-        """What makes parts fail at a client's word; set by whoever simulates them."""
+        """Injects failures on request of a client. Set by the simulation."""
         self.logs: LogStore = NoLogs()
         """Where clients find the flight logs; whoever writes them sets it."""
         self.on_setpoint: Callable[[Wire, int], None] | None = None

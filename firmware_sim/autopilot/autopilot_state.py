@@ -203,7 +203,7 @@ class CommanderStatus(NamedTuple):
 
     arming: Arming
     mode: Mode
-    """What flies now; in a failsafe it may differ from what the user asked for."""
+    """Active mode. A failsafe may replace the intended one."""
     intended_mode: Mode
     landed: Landed
     failsafe: bool

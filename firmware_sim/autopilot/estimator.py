@@ -14,12 +14,13 @@ import numpy as np
 
 from airl_mav.core.constants import TICK_S, US_PER_S
 from airl_mav.core.frames import (
+    HOME,
+    MAGNETIC_DECLINATION,
     Geodetic,
     Vector,
     geodetic_to_local,
     local_to_geodetic,
 )
-from airl_mav.core.location import HOME, MAGNETIC_DECLINATION
 from airl_mav.vehicle.atmosphere import altitude_m
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.alignment import Alignment

@@ -1,7 +1,7 @@
 """Whether a compass measures the earth's field: by its strength, and by how steeply it dips.
 
 Source: PX4 1.16, EKF2 `checkMagField` and its parameters; the field that is expected is that of the
-place (`core.location`), in PX4 by the World Magnetic Model.
+place (`core.frames`), in PX4 by the World Magnetic Model.
 """
 
 from __future__ import annotations
@@ -13,8 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from airl_mav.core.frames import Vector
-from airl_mav.core.location import MAGNETIC_FIELD_NED
+from airl_mav.core.frames import MAGNETIC_FIELD_NED, Vector
 from airl_mav.vehicle.rotation import Quat, rotate
 
 STRENGTH_GAUSS = float(np.linalg.norm(MAGNETIC_FIELD_NED))

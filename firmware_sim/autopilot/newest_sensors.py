@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from airl_mav.core.frames import Vector, local_to_geodetic
-from airl_mav.core.location import HOME
+from airl_mav.core.frames import HOME, Vector, local_to_geodetic
 from firmware_sim.engine.record import GPS_ROW, SEEN, Record
 from firmware_sim.interfaces import GpsFix, SensorSample
 

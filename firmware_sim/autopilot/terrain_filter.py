@@ -74,7 +74,7 @@ class TerrainFilter:
             self.variance += rate * STEP_S * TICK_S
 
     def restart(self, covariance: Vector) -> None:
-        """Go on from another covariance; what of the errors is known anew tells of no ground."""
+        """Continue with another covariance. Uncorrelated states lose that with the ground."""
         self._inner.restart(covariance)
         alone = np.count_nonzero(covariance, axis=1) <= 1
         self.cross[alone] = 0.0

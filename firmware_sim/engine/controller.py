@@ -6,8 +6,12 @@ from typing import NamedTuple
 
 from airl_mav.control.demand import AnyDemand, AttitudeDemand, Demand, TrajectoryDemand
 from airl_mav.control.gains import Gains, pack
-from airl_mav.control.low_pass import butterworth
-from airl_mav.control.memory import reset_integrals, settle_gyro_filter, ticks_to_motors
+from airl_mav.control.memory import (
+    butterworth,
+    reset_integrals,
+    settle_gyro_filter,
+    ticks_to_motors,
+)
 from airl_mav.control.mixer import Motors
 from airl_mav.core.constants import TICK_S
 from airl_mav.core.frames import Vector

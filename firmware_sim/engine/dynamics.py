@@ -6,13 +6,15 @@ from airl_mav.core.frames import Vector
 from airl_mav.core.kernels import kernel
 from airl_mav.profiles.vehicle import Battery
 from airl_mav.vehicle.airframe import airframe_of
-from airl_mav.vehicle.battery import drain, open_circuit, terminal_voltage
 from airl_mav.vehicle.power import (
+    drain,
     felt,
     felt_share,
     flight_power_w,
+    open_circuit,
     power_model_of,
     standing_power_w,
+    terminal_voltage,
 )
 from airl_mav.vehicle.rigid_body import drag_force
 from airl_mav.vehicle.rotation import Vec, rotate

@@ -25,9 +25,16 @@ from airl_mav.control.cascade import (
 from airl_mav.control.demand import AttitudeDemand, Demand, RateDemand, TrajectoryDemand
 from airl_mav.control.gains import unpack
 from airl_mav.core.constants import GRAVITY_M_S2, TICK_S, US_PER_S
-from airl_mav.core.frames import Geodetic, Vector, geodetic_to_local, local_to_geodetic
+from airl_mav.core.frames import (
+    HOME,
+    MAGNETIC_DECLINATION,
+    MAGNETIC_FIELD_NED,
+    Geodetic,
+    Vector,
+    geodetic_to_local,
+    local_to_geodetic,
+)
 from airl_mav.core.kernels import kernel, large_kernel
-from airl_mav.core.location import HOME, MAGNETIC_DECLINATION, MAGNETIC_FIELD_NED
 from airl_mav.vehicle import atmosphere
 from airl_mav.vehicle.airframe import airframe_of
 from airl_mav.vehicle.rigid_body import accelerate, drift

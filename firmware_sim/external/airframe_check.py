@@ -32,7 +32,7 @@ _ARDUPILOT_QUAD_X: Mapping[int, Corner] = dict(enumerate(CORNERS, start=1))
 
 @dataclass(frozen=True)
 class Airframe:
-    """What one kind of firmware must be configured to."""
+    """Required configuration of one kind of firmware."""
 
     firmware: str
     """Name of the firmware in messages: PX4."""
@@ -54,11 +54,7 @@ class Airframe:
 
 
 def px4_airframe(vehicle: VehicleProfile, output: str) -> Airframe:
-    """Return a quad by PX4's control allocation; `output` is SITL_OUTPUT or HITL_OUTPUT.
-
-    Raises:
-        FirmwareMissingError: The profile has no section on PX4.
-    """
+    """Return a quad by PX4's control allocation, or raise FirmwareMissingError."""
     px4 = vehicle.px4
     if px4 is None:
         raise _no_table("px4")

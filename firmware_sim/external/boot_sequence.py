@@ -106,13 +106,8 @@ class ExternalFlightStack:
     ) -> None:
         """Compose the stack without starting it.
 
-        Args:
-            launcher: Starts the firmware.
-            observer: Of its MAVLink.
-            timeout_s: Timeout of each answer during the boot sequence [wall s].
-            on_close: Called when it is closed.
-            look_every_us: Minimum interval of reading the observer's link in flight, where it
-                cannot signal [µs].
+        `timeout_s` is that of each answer during the boot sequence [wall s]. The observer's link is
+        read in flight at least `look_every_us` apart, where it cannot signal.
         """
         self._on_close = on_close
         self._launcher = launcher

@@ -23,12 +23,10 @@ class Bridge(Protocol):
     """The firmware's own time of the newest exchange [µs]; 0 before the first."""
 
     def wait_connected(self, timeout_s: float, alive: Callable[[], None]) -> None:
-        """Wait until the firmware has connected.
+        """Wait until the firmware has connected, at most `timeout_s` [wall s].
 
-        Args:
-            timeout_s: Timeout [wall s].
-            alive: Polled here and by every later `step` that waits; raises when the process has
-                died.
+        `alive` is polled here and by every later `step` that waits, and raises when the process has
+        died.
 
         Raises:
             FirmwareMissingError: It did not connect in time.

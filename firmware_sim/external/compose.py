@@ -43,11 +43,7 @@ class Wanted:
 
 
 def real_firmware(wanted: Wanted) -> ExternalFlightStack:
-    """Bind the ports of real firmware and return it, not yet started.
-
-    Raises:
-        UsageError: A port is taken, or program or profile section are missing.
-    """
+    """Bind the ports of real firmware and return it, not yet started. Raises UsageError."""
     launcher, endpoint = _PARTS[wanted.aircraft.firmware](wanted)
     observer = Observer(endpoint, "observer", wanted.vehicle.told_origin)
     return ExternalFlightStack(launcher, observer, wanted.aircraft.real.firmware_timeout)
@@ -64,7 +60,7 @@ def _px4(wanted: Wanted) -> tuple[Launcher, Endpoint]:
 def px4_parts(
     wanted: Wanted, instance: int, bridge: Callable[[int], Px4Bridge]
 ) -> tuple[Launcher, Endpoint]:
-    """Bind the observer's end of PX4's payload link; return PX4's launcher and that end.
+    """Bind the observer's end of PX4's payload link. Return PX4's launcher and that end.
 
     `instance` moves the ports; `bridge` opens the simulator interface on one.
     """

@@ -1,6 +1,6 @@
 """PX4 SITL for a conducted companion: the companion's link, and its own instance.
 
-Only PX4's boot runs by the wall clock; a busy host slows a flight down but never ends it.
+Only PX4's boot runs by the wall clock. A busy host slows a flight down but never ends it.
 """
 
 from __future__ import annotations
@@ -50,10 +50,8 @@ def conducted_px4(aircraft: Aircraft, vehicle: VehicleProfile, log: Path | None)
     """Bind the ports of an instance of PX4 and return it, not yet started.
 
     PX4 started here gets the first free instance from the requested one on, so that parallel
-    flights find different ones. `log` takes its output; None: a file in its folder.
-
-    Raises:
-        UsageError: No instance is free, or the program is not there.
+    flights find different ones. `log` takes its output; None: a file in its folder. Raises
+    UsageError: no instance is free, or the program is not there.
     """
     ask_for_short_slices()
     real = aircraft.real

@@ -27,16 +27,11 @@ class Launcher:
         program: Callable[[Path], StartCommand] | None = None,
         folders: WorkingFolders | None = None,
     ) -> None:
-        """Configure the launch.
+        """Configure the launch; the bridge opens the simulator interface for one flight.
 
-        Args:
-            airframe: Required configuration.
-            bridge: Opens the simulator interface for one flight.
-            timeout_s: Timeout for connecting [wall s].
-            reboots: Whether it restarts by itself on a reboot command.
-            program: Writes files to an empty working folder and returns the command to run there;
-                None = the user starts it.
-            folders: Its working folders and log.
+        `timeout_s` is that of connecting [wall s]; the firmware `reboots` by itself on command.
+        `program` writes files to an empty working folder and returns the command to run there; None
+        = the user starts it.
         """
         self.airframe = airframe
         self.may_set = program is not None

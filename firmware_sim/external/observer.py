@@ -129,7 +129,6 @@ class Observer:
         self._came: set[str] = set()
         self._text = ""
         self.last_text = ""
-        """The last text received."""
         self._beat_us = -BEAT_EVERY_US
         self.acts_as_ground_station = True
         """Whether it sends the heartbeat of a ground station: PX4 sends texts only to such."""

@@ -134,11 +134,7 @@ class FirmwareProcess(ChildProcess):
     """One process of external firmware; it ends with us, also when we are killed."""
 
     def __init__(self, name: str, command: StartCommand, cwd: Path, log: Path) -> None:
-        """Start a named program in a folder, appending its output to `log`.
-
-        Raises:
-            FirmwareMissingError: The program is missing or not executable.
-        """
+        """Start a program in a folder, output appended to `log`, or raise FirmwareMissingError."""
         self.name = name
         program = Path(command.argv[0])
         if not os.access(program, os.X_OK) or not program.is_file():
@@ -161,10 +157,8 @@ class WorkingFolders:
     def __init__(self, name: str, kept: Path | None, log: Path | None) -> None:
         """Choose the folders of a firmware, such as px4.
 
-        Args:
-            name: Name of the firmware.
-            kept: Folder that keeps the working folders; None = temporary ones, one at a time.
-            log: Log of its output; None = a file beside the working folders.
+        `kept` keeps the working folders, None = temporary ones, one at a time; `log` holds its
+        output, None = a file beside the working folders.
         """
         self._name = name
         self._flights = 0

@@ -42,13 +42,10 @@ def slowness(acting: Sequence[Acting]) -> dict[int, float]:
 def weakened(
     controls: ActuatorControls, left: Mapping[int, float], thrust_curve: float
 ) -> ActuatorControls:
-    """Return the commands that give healthy motors the thrust that the failing ones have.
+    """Return commands that give healthy motors the thrust of failing ones.
 
-    Args:
-        controls: What the flight controller commands.
-        left: Share of its thrust that each failing motor has, by its index; more than 1 is more
-            than it should be, up to its greatest thrust.
-        thrust_curve: Of the airframe (`vehicle.rotor.steady_speed`).
+    `left` is the share of its thrust that each failing motor has, by its index. More than 1 is more
+    than it should be, up to its greatest thrust.
     """
     motors = list(controls.motors)
     for index, share in left.items():
@@ -67,16 +64,10 @@ def slowed(
 ) -> ActuatorControls:
     """Return the commands after which healthy motors have the speeds that slow ones would have.
 
-    A motor of time constant `k tau` keeps the share `lag^(1/k)` of its speed's error over a tick.
-    A healthy one gets as far in that tick where it is told to go a share of the way: exactly
-    (1 - lag^(1/k)) / (1 - lag) of it.
-
-    Args:
-        controls: What the flight controller commands.
-        slow: Factor k of each slow motor's time constant, by its index.
-        speeds: Of the rotors now, as shares of that at full command.
-        lag: Share of its speed's error that a healthy motor keeps over a tick, exp(-dt / tau).
-        thrust_curve: Of the airframe.
+    A motor of time constant `k tau` keeps the share `lag^(1/k)` of its speed's error over a tick, a
+    healthy one `lag` = exp(-dt / tau). It gets as far in that tick where it is told to go a share
+    of the way: exactly (1 - lag^(1/k)) / (1 - lag) of it. `slow` has the factor k of each slow
+    motor by its index, `speeds` the rotors' now, as shares of that at full command.
     """
     motors = list(controls.motors)
     for index, factor in slow.items():
@@ -88,13 +79,7 @@ def slowed(
 
 
 def misread(reading: BatterySample, acting: Sequence[Acting], battery: Battery) -> BatterySample:
-    """Return what a power module reads whose battery fails: `off` is empty, `sag` a lower voltage.
-
-    Args:
-        reading: Without the faults.
-        acting: Faults of the battery.
-        battery: The battery.
-    """
+    """Return a power module's reading: of a failing battery, empty when `off`, lower by `sag`."""
     for _, fault, *_ in acting:
         if fault.kind == "off":
             empty_v = battery.cells * battery.cell_empty_v

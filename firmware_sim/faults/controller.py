@@ -2,21 +2,54 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import numpy as np
+
+from airl_mav.core.constants import US_PER_S
+from airl_mav.core.frames import Vector
 from airl_mav.faults.kinds import MOTORS, SENSORS
+from airl_mav.faults.schedule import gust_share
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.vehicle.airframe import Airframe
 from firmware_sim.engine.dynamics import Speeds
 from firmware_sim.faults.actuation import misread, slowed, slowness, thrust_left, weakened
 from firmware_sim.faults.sensors import Effect, effect_of, failed
 from firmware_sim.faults.timeline import Acting, FaultTimeline
-from firmware_sim.faults.wind import Gusts, gust_at
 from firmware_sim.flight_controller import FlightController
 from firmware_sim.interfaces import ActuatorControls, SensorSample
-from firmware_sim.plant.plant import Plant
+from firmware_sim.plant.plant import Blowing, Plant
+
+
+def gust_at(acting: Sequence[Acting], time_us: int) -> Vector:
+    """Return the wind (3,) NED [m/s] that faults add at a time [µs]."""
+    total = np.zeros(3)
+    for each in acting:
+        share = 1.0
+        if each.fault.kind == "gust":
+            elapsed_us, whole_us = time_us - each.since_us, each.until_us - each.since_us
+            share = gust_share(elapsed_us / US_PER_S, whole_us / US_PER_S)
+        total += share * np.array(each.fault.value)
+    return total
+
+
+class Gusts:
+    """A wind, and what faults add to it."""
+
+    def __init__(self, wind: Blowing) -> None:
+        """Take the wind that blows anyway."""
+        self.more: Vector | None = None
+        """(3,) NED [m/s], set for the tick that comes; None: nothing."""
+        self._wind = wind
+
+    def step(self) -> Vector:
+        """Advance one tick and return the wind (3,) NED [m/s]."""
+        wind = self._wind.step()
+        return wind if self.more is None else wind + self.more
 
 
 class FailingParts:
-    """What lies between the plant and the flight controller, and fails.
+    """Failing parts between the plant and the flight controller.
 
     It works on any flight controller: the built-in one, or real firmware behind its simulator
     interface.
@@ -29,13 +62,10 @@ class FailingParts:
         vehicle: VehicleProfile,
         timeline: FaultTimeline,
     ) -> None:
-        """Put it in between; nothing fails yet.
+        """Put it between controller and plant; nothing fails yet.
 
-        Args:
-            controller: Who flies.
-            plant: What is flown: gusts are added to its wind, and its charge drops.
-            vehicle: Its profile: noise of the sensors, the battery, the motors' curve.
-            timeline: The faults of the episode.
+        Gusts are added to the plant's wind, and its charge drops. The profile has the noise of the
+        sensors, the battery, and the motors' curve.
         """
         self._controller = controller
         self._plant = plant

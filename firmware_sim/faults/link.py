@@ -111,7 +111,7 @@ class Lane(Generic[Frame]):
 
 
 class FailingSender:
-    """What sends to one peer over a failing link. Implements `endpoint.Endpoint`."""
+    """Sender to one peer over a failing link. Implements `endpoint.Endpoint`."""
 
     def __init__(self, endpoint: Endpoint, clock: Clock, *, conducted: bool) -> None:
         """Take what sends over a healthy link; the rest as of `FailingEndpoint`."""
@@ -164,13 +164,9 @@ class FailingEndpoint(FailingSender):
     def __init__(self, endpoint: SharedEndpoint, clock: Clock, *, conducted: bool = False) -> None:
         """Take the healthy endpoint and simulated time.
 
-        Args:
-            endpoint: What it lies around.
-            clock: Simulated time.
-            conducted: Whether a companion in lockstep is at the other end. A command and its answer
-                are one moment of simulated time then: only a cut stops them, all other faults act
-                on setpoints and telemetry. Frames arrive with a tick, so that the flight is the
-                same every time.
+        If `conducted`, a companion in lockstep is at the other end. A command and its answer are
+        one moment of simulated time then: only a cut stops them, all other faults act on setpoints
+        and telemetry. Frames arrive with a tick, so that the flight is the same every time.
         """
         super().__init__(endpoint, clock, conducted=conducted)
         self._shared = endpoint
@@ -183,10 +179,7 @@ class FailingEndpoint(FailingSender):
         self._generators: dict[tuple[int, int, int], np.random.Generator] = {}
 
     def begin(self, timeline: FaultTimeline | None) -> None:
-        """Begin an episode: what was under way is lost, and these faults act; None: nothing fails.
-
-        To be called once for every episode.
-        """
+        """Begin an episode with these faults, once for each; what was under way is lost."""
         self._timeline = timeline
         self._generators.clear()
         self._up.clear()

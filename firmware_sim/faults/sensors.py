@@ -42,7 +42,7 @@ INERTIAL = ("accel", "gyro")
 
 
 class Effect(Protocol):
-    """What a fault does to one sensor; has a memory of its own."""
+    """Effect of a fault on one sensor; has a memory of its own."""
 
     def __call__(self, value: Any, time_us: int) -> Any:
         """Return what is measured instead of `value` at a time; None: nothing is, in this tick."""
@@ -181,14 +181,7 @@ def noise_sd(part: str, profile: Sensors, tick_s: float) -> Vector:
 
 
 def effect_of(acting: Acting, profile: Sensors, tick_s: float, rng: np.random.Generator) -> Effect:
-    """Return what a fault of a sensor does.
-
-    Args:
-        acting: The fault.
-        profile: The sensors.
-        tick_s: Length of a tick [s].
-        rng: The fault's own randomness.
-    """
+    """Return the effect of a sensor's fault; `rng` is the fault's own."""
     fault = acting.fault
     part, kind = fault.part, fault.kind
     if kind == "off" and part not in INERTIAL:

@@ -1,4 +1,4 @@
-"""Which faults of an episode act now, and which have acted: what all places of faults share."""
+"""Faults of an episode that act now, and that have acted; those of clients among them."""
 
 from __future__ import annotations
 
@@ -31,12 +31,11 @@ class Acting(NamedTuple):
     """A fault that acts now."""
 
     number: int
-    """Which one of the episode it is, from 0."""
+    """Number in the episode, from 0."""
     fault: Fault
     since_us: int
-    """When it began [µs]."""
     until_us: int
-    """When it ends; `FOREVER_US` for never [µs]."""
+    """`FOREVER_US` for never."""
 
 
 class Acted(NamedTuple):
@@ -59,13 +58,7 @@ class FaultTimeline:
     """The faults of one episode. Asked once a tick; everything else only when something changes."""
 
     def __init__(self, faults: Sequence[Fault], seed: int, start_us: int) -> None:
-        """Begin an episode.
-
-        Args:
-            faults: What was asked for.
-            seed: Of the episode.
-            start_us: When it begins [µs].
-        """
+        """Begin an episode with these faults at `start_us`."""
         self._faults = list(faults)
         self._seed = seed
         self._entered: dict[str, int] = {}
@@ -160,3 +153,26 @@ class FaultTimeline:
         begin_us, end_us = self._acting[index]
         until_us = end_us if end_us == FOREVER_US else self._start_us + end_us
         return Acting(index, self._faults[index], self._start_us + begin_us, until_us)
+
+
+class ClientFaults:
+    """Puts what clients inject among the faults of an episode. Implements `port.Failures`."""
+
+    def __init__(self, timeline: Callable[[], FaultTimeline]) -> None:
+        """Take what returns the faults of the episode, at the present time.
+
+        It is asked first when something is injected. Until then nothing lies between the plant and
+        the flight controller.
+        """
+        self._timeline = timeline
+        self._injected = False
+
+    def inject(self, fault: Fault) -> None:
+        """Let a part fail from now on."""
+        self._injected = True
+        self._timeline().inject(fault)
+
+    def clear(self, part: Part) -> None:
+        """End all that acts on a part."""
+        if self._injected:
+            self._timeline().clear(part)

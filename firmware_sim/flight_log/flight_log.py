@@ -48,12 +48,8 @@ class FlightLog:
     ) -> None:
         """Open the log; see `UlogWriter`.
 
-        Args:
-            path: Its final name, given on closing.
-            parameters: Parameters of the vehicle at the start.
-            start_us: Simulated time now [µs].
-            boot_unix_us: Calendar time of simulated time 0 [µs since 1970].
-            on_lost: Called once when it cannot be written any more; see `LogFile`.
+        `path` is its final name, given on closing; `boot_unix_us` is the calendar time of simulated
+        time 0 [µs since 1970].
         """
         self._boot_unix_us = boot_unix_us
         self.began_unix_us = boot_unix_us + start_us
@@ -108,13 +104,7 @@ class FlightLog:
         self._writer.flush()
 
     def after_ticks(self, flown: Record, truths: Record, state: AutopilotState) -> None:
-        """Log what is due in ticks.
-
-        Args:
-            flown: (n,) log of the flight controller (`engine.record.FLOWN_TICK`).
-            truths: (n,) log of the aircraft after each of them (`engine.record.TRUE_TICK`).
-            state: The autopilot's, after the last.
-        """
+        """Log what is due in n ticks, given their logs and the autopilot's state after the last."""
         if self._writer.lost:
             return
         rows = (flown[name].tolist() for name in ("time_us", "gyro", "accel"))

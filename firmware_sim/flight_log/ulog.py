@@ -77,15 +77,10 @@ class UlogWriter(LogFile):
         parameters: Iterable[tuple[str, int | float]],
         on_lost: Callable[[str], None] = lambda _: None,
     ) -> None:
-        """Open the file, whose final name is `path`, and write its head.
+        """Open the file, whose final name is `path`, and write its head; `on_lost` as of `LogFile`.
 
-        Args:
-            path: The log.
-            start_us: Simulated time at which the log begins [µs].
-            topics: Topics in the order of `sample`'s numbers.
-            info: Facts by ULog keys; numbers are written as uint32_t.
-            parameters: Names and values; an int is written as int32_t.
-            on_lost: See `LogFile`.
+        Topics come in the order of `sample`'s numbers. Info has ULog keys, numbers as uint32_t. An
+        int parameter is written as int32_t.
         """
         super().__init__(path, on_lost)
         topics = tuple(topics)

@@ -62,7 +62,7 @@ _UNKNOWN = math.nan
 
 
 class Moment(NamedTuple):
-    """What a vehicle and its simulator know after a tick."""
+    """State of a vehicle and its simulator after a tick."""
 
     state: AutopilotState
     truth: Truth

@@ -183,7 +183,7 @@ class Clients:
             backlog.extend(self._heard(*arrived, now_us))
 
     def _heard(self, peer: Peer, chunk: bytes, now_us: int) -> Iterator[tuple[Client, WireMessage]]:
-        """Yield what a chunk says, and who has sent it; nothing of what exceeds an allowance."""
+        """Yield the messages of a chunk with their client. Excess over an allowance is dropped."""
         client = self._clients.get(peer)
         if client is None:
             client, messages = self._meet(peer, chunk, now_us)

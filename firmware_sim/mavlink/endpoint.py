@@ -172,8 +172,8 @@ class UdpEndpoint:
     """A bound UDP socket with a preset remote, like a PX4 SITL link.
 
     Frames are sent to the preset remote from the first tick, before anything was received.
-    Whoever tells its peers apart uses `arrivals` and `towards`. With `receive` and `send`, a peer
-    that sends from another address gets all frames, too: the newest such peer.
+    `arrivals` and `towards` distinguish peers. `receive` and `send` do not: the newest peer at
+    another address gets all frames, too.
     """
 
     datagrams = True

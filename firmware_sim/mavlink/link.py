@@ -258,7 +258,9 @@ class Link:
             if builder in payloads:
                 payload = payloads[builder]
             else:
-                payload = payloads[builder] = _payload(shape, builder(state))
+                values = builder(state)
+                payload = None if values is None else _payload(shape, values)
+                payloads[builder] = payload
             if payload:
                 frames.append(encoder.frame(shape, payload))
             elif payload is not None:

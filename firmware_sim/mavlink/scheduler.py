@@ -49,8 +49,9 @@ class StreamScheduler:
         self.intervals_us = np.array(self._default, np.int64)
         """(s,) intervals [µs]; `OFF` = not sent."""
         self.due_us = np.zeros(len(self._names), np.int64)
-        """(s,) next times [µs]."""
-        self._slow = np.flatnonzero(self.numbers < 0)
+        """(s,) next times of the fast streams [µs]."""
+        self._slow_due_us: dict[int, int] = {}
+        """Next times of the other streams that are sent [µs], by their place."""
         self._fast = np.flatnonzero(self.numbers >= 0)
         self.fast_us = 0
         """When the next of the fast streams is due, or earlier [µs]."""
@@ -77,7 +78,7 @@ class StreamScheduler:
         if interval_us == self.intervals_us[index]:
             return
         self.intervals_us[index] = interval_us
-        self.due_us[index] = _NEVER if interval_us == OFF else now_us
+        self._plan(index, now_us)
         self.wake_us = self._next_us = self.fast_us = min(self.wake_us, now_us)
 
     def restart(self) -> None:
@@ -98,20 +99,29 @@ class StreamScheduler:
     def due(self, now_us: int) -> list[str]:
         """Return the streams to send at `now_us` [µs] and plan their next time."""
         self.begin(now_us)
-        if now_us < self._next_us or not len(self._slow):
+        if now_us < self._next_us:
             return []
-        due_us = self.due_us[self._slow]
-        (late,) = (due_us <= now_us).nonzero()
-        order = sorted(zip(due_us[late].tolist(), self._slow[late].tolist(), strict=True))
-        intervals = self.intervals_us[self._slow[late]]
-        due_us[late] += intervals * (1 + (now_us - due_us[late]) // intervals)
-        self.due_us[self._slow] = due_us
-        self._next_us = int(np.minimum.reduce(due_us))
+        plan, names = self._slow_due_us, []
+        for due_us, i in sorted([(due_us, i) for i, due_us in plan.items() if due_us <= now_us]):
+            interval_us = self.intervals_us.item(i)
+            plan[i] = due_us + interval_us * (1 + (now_us - due_us) // interval_us)
+            names.append(self._names[i])
+        self._next_us = min(plan.values(), default=_NEVER)
         self.wake_us = min(self.fast_us, self._next_us)
-        return [self._names[i] for _, i in order]
+        return names
+
+    def _plan(self, index: int, due_us: int) -> None:
+        """Plan the next time of a stream that is sent, or forget one that is not."""
+        sent = self.intervals_us.item(index) != OFF
+        if self.numbers.item(index) >= 0:
+            self.due_us[index] = due_us if sent else _NEVER
+        elif sent:
+            self._slow_due_us[index] = due_us
+        else:
+            self._slow_due_us.pop(index, None)
 
     def _rebase(self, now_us: int) -> None:
         self._rebase_pending = False
-        for i, interval in enumerate(self.intervals_us.tolist()):
-            self.due_us[i] = _NEVER if interval == OFF else now_us + i * TICK_US % interval
+        for i, interval_us in enumerate(self.intervals_us.tolist()):
+            self._plan(i, now_us if interval_us == OFF else now_us + i * TICK_US % interval_us)
         self.wake_us = self._next_us = self.fast_us = now_us

@@ -11,8 +11,7 @@ import numpy as np
 from airl_mav.core.clock import Clock
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.frames import Vector
-from airl_mav.core.signing import Signing
-from airl_mav.core.signing_key import StoredSigning
+from airl_mav.core.signing import Signing, StoredSigning
 from firmware_sim.autopilot.autopilot_state import Message
 from firmware_sim.autopilot.port import AutopilotPort
 from firmware_sim.engine.record import Record
@@ -30,7 +29,7 @@ from firmware_sim.mavlink.radio import Radio
 from firmware_sim.mavlink.senders import Senders
 from firmware_sim.mavlink.services import handle, peers, send_pending
 from firmware_sim.mavlink.services.context import Context
-from firmware_sim.mavlink.services.running_calibration import RunningCalibration
+from firmware_sim.mavlink.services.transfers import RunningCalibration
 from firmware_sim.mavlink.streams import BUILDERS, Builder
 from firmware_sim.mavlink.streams.status import system_time
 from firmware_sim.mavlink.telemetry import Ints, context_of, flown_of
@@ -58,8 +57,8 @@ TEXTS_PER_TICK = 8
 """Texts of services that go to all operators per tick."""
 
 TEXTS_PER_S, TEXTS_BURST = 20, 50
-"""The same per second, for long and at once: each is told to all clients of all links, and as an
-event takes the place of one that somebody may still ask for."""
+"""Texts per second, and in a burst. All clients get each of them. Its event displaces an older one
+in the buffer."""
 
 FORGET_EVERY_US = US_PER_S
 """Silent clients are looked for so often [µs]."""

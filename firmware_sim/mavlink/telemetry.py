@@ -20,9 +20,8 @@ from numpy.typing import NDArray
 
 from airl_mav.core.clock import NS_PER_US
 from airl_mav.core.constants import GRAVITY_M_S2
-from airl_mav.core.frames import Geodetic, Vector, geodetic_to_local, local_to_geodetic
+from airl_mav.core.frames import HOME, Geodetic, Vector, geodetic_to_local, local_to_geodetic
 from airl_mav.core.kernels import kernel, large_kernel
-from airl_mav.core.location import HOME
 from airl_mav.vehicle import atmosphere
 from airl_mav.vehicle.rotation import rotate, yaw_of
 from firmware_sim.autopilot import error_state as es

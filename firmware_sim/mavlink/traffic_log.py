@@ -17,7 +17,7 @@ MAX_BYTES = 1 << 28
 
 
 class TrafficLog:
-    """The main log is that of one client; who else speaks gets one of its own beside it."""
+    """One tlog per client. The main one is that of the preset remote."""
 
     def __init__(self, now_us: Callable[[], int]) -> None:
         """Take what returns the simulated time [µs]."""

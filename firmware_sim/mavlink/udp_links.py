@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from airl_mav.core.clock import Clock
-from airl_mav.core.signing_key import StoredSigning
+from airl_mav.core.signing import StoredSigning
 from firmware_sim.mavlink.endpoint import (
     Address,
     Endpoint,

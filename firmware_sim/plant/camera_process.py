@@ -109,7 +109,7 @@ class CameraProcess:
     def _read(self, line: Connection) -> None:
         """Take in what arrives until the process has ended.
 
-        An image is larger than what fits into the line: who reads it waits for one that gives way.
+        An image exceeds the pipe's buffer. Its reader waits for the writer.
         """
         with suppress(EOFError, OSError):
             while True:

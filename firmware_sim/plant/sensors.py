@@ -8,8 +8,7 @@ from collections import deque
 import numpy as np
 
 from airl_mav.core.constants import TICK_S, US_PER_S
-from airl_mav.core.frames import Vector, local_to_geodetic
-from airl_mav.core.location import HOME
+from airl_mav.core.frames import HOME, Vector, local_to_geodetic
 from airl_mav.profiles.sensors import Sensors, Vision
 from airl_mav.vehicle.rotation import (
     Quat,

@@ -24,11 +24,12 @@ from scipy.stats import chi2
 import firmware_sim.autopilot
 from airl_mav.core.constants import GRAVITY_M_S2, TICK_S, TICK_US
 from airl_mav.core.frames import (
+    HOME,
+    MAGNETIC_FIELD_NED,
     geodetic_to_local,
     local_to_geodetic,
     quat_wxyz_to_xyzw,
 )
-from airl_mav.core.location import HOME, MAGNETIC_FIELD_NED
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.autopilot_state import Estimate
 from firmware_sim.autopilot.error_state import GATE, N_STATES

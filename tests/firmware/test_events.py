@@ -22,7 +22,6 @@ from firmware_sim.autopilot.autopilot_state import Message, Mode, Result, Severi
 from firmware_sim.autopilot.events import flight_events
 from firmware_sim.autopilot.events.definition import (
     FORMATS,
-    MAX_ARGUMENT_BYTES,
     Event,
     Level,
     sub_id,
@@ -46,7 +45,7 @@ from firmware_sim.autopilot.sensor_monitor import ACCEL, BARO, GPS, GYRO, MAG, S
 from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.event_buffer import FIRST_SEQUENCE, KEPT
 from firmware_sim.mavlink.services import component_metadata
-from firmware_sim.mavlink.services.event_metadata import definitions
+from firmware_sim.mavlink.services.component_metadata import definitions
 from tests.support import flight_rig
 from tests.support.flown_by_mavsdk import Flown, flown
 from tests.support.mavlink_clients import RawClient, Rig, wait_for
@@ -105,7 +104,7 @@ def test_every_event_has_a_number_of_its_own_and_room_for_its_arguments() -> Non
     assert len({definition.number for definition in listed}) == len(listed) > 50
     for definition in listed:
         event = definition.event(*[0] * len(definition.arguments))
-        assert len(event.arguments) <= MAX_ARGUMENT_BYTES
+        assert len(event.arguments) <= 25  # PX4's limit
         highest = max([int(n) for n in re.findall(r"\{(\d)", definition.message)], default=0)
         assert highest <= len(definition.arguments)
 

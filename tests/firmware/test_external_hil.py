@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common as dialect
 
-from airl_mav.core.frames import Geodetic
-from airl_mav.core.location import HOME
+from airl_mav.core.frames import HOME, Geodetic
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim.external.px4 import hil_messages as hil
 from firmware_sim.interfaces import BatterySample, GpsFix, SensorSample, Truth

@@ -13,8 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.errors import FieldError
-from airl_mav.core.frames import Vector, geodetic_to_local, quat_wxyz_to_xyzw, quat_yaw
-from airl_mav.core.location import HOME
+from airl_mav.core.frames import HOME, Vector, geodetic_to_local, quat_wxyz_to_xyzw, quat_yaw
 from airl_mav.experiments.fault_matrix import fly_fault
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.model import Scenario

@@ -12,8 +12,7 @@ import pytest
 
 from airl_mav.camera.frame import Frame
 from airl_mav.core.clock import SimClock
-from airl_mav.core.frames import geodetic_to_local
-from airl_mav.core.location import HOME
+from airl_mav.core.frames import HOME, geodetic_to_local
 from airl_mav.faults.model import Fault
 from airl_mav.profiles.vehicle import VehicleProfile, load_vehicle
 from airl_mav.scenario.aircraft import Aircraft

@@ -7,8 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from airl_mav.core.frames import quat_from_euler, quat_to_matrix
-from airl_mav.core.location import MAGNETIC_FIELD_NED
+from airl_mav.core.frames import MAGNETIC_FIELD_NED, quat_from_euler, quat_to_matrix
 from firmware_sim.autopilot.autopilot_state import Result
 from firmware_sim.autopilot.magnetic_field import INCLINATION_RAD, STRENGTH_GAUSS, FieldCheck
 from tests.support.flight_rig import Rig

@@ -13,7 +13,7 @@ from pymavlink.dialects.v20 import common as dialect
 
 from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import US_PER_S
-from airl_mav.core.signing_key import StoredSigning
+from airl_mav.core.signing import StoredSigning
 from firmware_sim.autopilot.autopilot_state import Arming
 from firmware_sim.mavlink import clients, codec, server, tick_time, traffic_log
 from firmware_sim.mavlink.codec import Decoder, WireMessage

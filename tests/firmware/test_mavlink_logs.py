@@ -18,7 +18,7 @@ from firmware_sim.engine.record import TRUE_TICK
 from firmware_sim.flight_log.flight_log import FlightLog
 from firmware_sim.flight_log.log_folder import LogFolder
 from firmware_sim.mavlink.codec import dialect
-from firmware_sim.mavlink.services.log_transfer import NO_MESSAGE
+from firmware_sim.mavlink.services.transfers import NO_MESSAGE
 from firmware_sim.mavlink.telemetry import flown_of
 from tests.support.kinematic_autopilot import KinematicAutopilot
 from tests.support.mavlink_clients import (

@@ -25,7 +25,7 @@ from mavsdk.plugins.telemetry import FlightMode, LandedState, Telemetry
 from pymavlink.dialects.v20 import common as dialect
 
 from airl_mav.core.constants import US_PER_S
-from airl_mav.core.location import HOME
+from airl_mav.core.frames import HOME
 from firmware_sim.autopilot.autopilot_state import Arming, Message, Mode, Setpoint, Severity
 from firmware_sim.interfaces import Truth
 from firmware_sim.mavlink.endpoint import UdpEndpoint

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from airl_mav.core.frames import Geodetic, geodetic_to_local
-from airl_mav.core.location import HOME
+from airl_mav.core.frames import HOME, Geodetic, geodetic_to_local
 from firmware_sim.autopilot.manual_control import Sticks
 from firmware_sim.interfaces import Truth
 from firmware_sim.mavlink.codec import dialect

@@ -14,8 +14,7 @@ from scipy.spatial.transform import Rotation
 from airl_mav.arena.geometry import Arena
 from airl_mav.core.constants import TICK_S
 from airl_mav.core.errors import FieldError
-from airl_mav.core.frames import Vector
-from airl_mav.core.location import HOME
+from airl_mav.core.frames import HOME, Vector
 from airl_mav.experiments.fault_matrix import fly_fault
 from airl_mav.faults.catalogue import FITTED_CASES, Case
 from airl_mav.profiles.sensors import OpticalFlow as Profile

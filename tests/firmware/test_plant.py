@@ -14,8 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape, Tour
 from airl_mav.core.constants import TICK_S, TICK_US
-from airl_mav.core.frames import Vector
-from airl_mav.core.location import HOME
+from airl_mav.core.frames import HOME, Vector
 from airl_mav.profiles.conditions import WindSettings
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.sensors import Sensors
@@ -638,7 +637,7 @@ def test_level_and_facing_north_the_magnetometer_reads_the_field_of_zurich(
 ) -> None:
     field = make().sense().mag
     assert field is not None
-    # World Magnetic Model 2020-2025 at 47.4 N 8.5 E, as location.py states it.
+    # World Magnetic Model 2020-2025 at 47.4 N 8.5 E, as frames.py states it.
     assert np.linalg.norm(field) == pytest.approx(0.482, abs=1e-3)
     assert math.degrees(math.atan2(field[1], field[0])) == pytest.approx(3.2, abs=0.05)
     dip = math.atan2(field[2], math.hypot(field[0], field[1]))

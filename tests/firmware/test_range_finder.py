@@ -13,7 +13,7 @@ from pymavlink.dialects.v20 import common as dialect
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError
-from airl_mav.core.location import HOME
+from airl_mav.core.frames import HOME
 from airl_mav.experiments.fault_matrix import fly_fault
 from airl_mav.faults.catalogue import FITTED_CASES, STANDS, Case
 from airl_mav.profiles.vehicle import load_vehicle

@@ -27,7 +27,7 @@ import pytest
 from pymavlink import mavutil
 
 from airl_mav.core.goals import Goal
-from airl_mav.core.signing_key import StoredSigning, write_key
+from airl_mav.core.signing import StoredSigning, write_key
 from airl_mav.flight.judge import Outcome
 from airl_mav.lockstep.flight import fly
 from airl_mav.lockstep.remote import RemoteStage

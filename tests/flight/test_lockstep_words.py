@@ -15,7 +15,7 @@ from pymavlink.dialects.v20 import common as dialect
 
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import validated
-from airl_mav.core.signing_key import StoredSigning, write_key
+from airl_mav.core.signing import StoredSigning, write_key
 from airl_mav.lockstep.camera import TokenCamera
 from airl_mav.lockstep.inbound import Inbound
 from airl_mav.lockstep.tokens import TokenPartner

@@ -26,8 +26,8 @@ from airl_mav.scenario.aircraft import Aircraft
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 from airl_mav.scenario.stand_alone import StandAloneVehicle
+from airl_mav.vehicle.airframe import draw_airframe
 from airl_mav.vehicle.rotation import rotate
-from airl_mav.vehicle.spread import draw_airframe
 from airl_mav.vehicle.wind import BLOCK, wind_of_episode
 from firmware_sim.interfaces import BatterySample
 from firmware_sim.plant.bullet import pybullet

@@ -13,14 +13,14 @@ from stable_baselines3.common.preprocessing import preprocess_obs
 from torch.nn import functional
 
 from airl_mav.core.errors import UsageError
-from airl_mav.training.algorithms import make_model
-from airl_mav.training.config import AlgorithmSpec, NetworkSpec
-from airl_mav.training.dqn import DoubleDQN
-from airl_mav.training.networks import (
+from airl_mav.training.algorithms import (
     DepthExtractor,
     flat_size,
+    make_model,
     to_channels_last,
 )
+from airl_mav.training.config import AlgorithmSpec, NetworkSpec
+from airl_mav.training.dqn import DoubleDQN
 from tests.support.policy_kit import parameters_of
 from tests.support.toy_fleet import HEIGHT, WIDTH, ToyFleet, observation_space
 

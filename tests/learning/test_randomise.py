@@ -12,8 +12,7 @@ from airl_mav.core.streams import Stream, stream
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import EnvironmentSpec, Randomisation
 from airl_mav.profiles.vehicle import load_vehicle
-from airl_mav.vehicle.airframe import Airframe
-from airl_mav.vehicle.spread import draw_airframe
+from airl_mav.vehicle.airframe import Airframe, draw_airframe
 
 NOMINAL = Airframe.from_profile(load_vehicle("quad"))
 GROUPS = {

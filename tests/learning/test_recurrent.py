@@ -23,9 +23,9 @@ from airl_mav.policy.learned import LearnedPolicy, load_learned
 from airl_mav.policy.observation import Observation
 from airl_mav.policy.observation_spec import ObservationSpec, SeenCamera
 from airl_mav.scenario.aircraft import Ports
+from airl_mav.training.algorithms import policy_arguments
 from airl_mav.training.config import NetworkSpec
 from airl_mav.training.export import export_sb3
-from airl_mav.training.networks import policy_arguments
 from airl_mav.training.recurrent import GreedyDecisions
 from tests.support.lockstep_kit import demo_scenario
 from tests.support.policy_kit import facts, make_model

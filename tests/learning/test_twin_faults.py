@@ -19,15 +19,14 @@ from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import spec_of
 from airl_mav.envs.trace import Trace
 from airl_mav.experiments.gym_flier import GymFlier
-from airl_mav.faults.model import Fault
-from airl_mav.faults.twin import check_twin
+from airl_mav.faults.model import Fault, check_twin
 from airl_mav.profiles.conditions import WindSettings
 from airl_mav.rehearsal.run_folder import RunFolder
 from airl_mav.scenario.aircraft import Aircraft
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
+from firmware_sim.faults.controller import gust_at
 from firmware_sim.faults.timeline import Acting
-from firmware_sim.faults.wind import gust_at
 from tests.learning.test_fleet import ENDLESS, OPEN, VEHICLE, PlantPilot, command
 from tests.support.blown import fly_blown
 

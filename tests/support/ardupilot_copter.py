@@ -11,8 +11,13 @@ from collections.abc import Callable
 import numpy as np
 
 from airl_mav.core.constants import TICK_US, US_PER_S
-from airl_mav.core.frames import local_to_geodetic, quat_normalize, quat_to_matrix
-from airl_mav.core.location import HOME, MAGNETIC_FIELD_NED
+from airl_mav.core.frames import (
+    HOME,
+    MAGNETIC_FIELD_NED,
+    local_to_geodetic,
+    quat_normalize,
+    quat_to_matrix,
+)
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.vehicle.atmosphere import pressure_hpa, temperature_c

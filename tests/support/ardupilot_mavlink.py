@@ -22,8 +22,7 @@ from firmware_sim.mavlink.endpoint import UdpEndpoint
 from firmware_sim.mavlink.event_buffer import EventBuffer
 from firmware_sim.mavlink.link import Link, LinkConfig
 from firmware_sim.mavlink.services import commands, handle
-from firmware_sim.mavlink.services.command import Command
-from firmware_sim.mavlink.services.context import Context, for_vehicle, sender
+from firmware_sim.mavlink.services.context import Command, Context, for_vehicle, sender
 from firmware_sim.mavlink.streams import BUILDERS, Builder, status
 from firmware_sim.mavlink.telemetry import context_of, flown_of
 from firmware_sim.mavlink.texts import TextEncoder

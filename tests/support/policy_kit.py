@@ -20,9 +20,9 @@ from airl_mav.policy.action_sets import ActionSpec, discrete_actions
 from airl_mav.policy.card import PolicyCard, PolicyFacts
 from airl_mav.policy.layouts import boxes, image_key
 from airl_mav.policy.observation_spec import Encoded, ObservationSpec
+from airl_mav.training.algorithms import DepthExtractor, dense_units
 from airl_mav.training.config import NetworkSpec
 from airl_mav.training.export import export_sb3
-from airl_mav.training.networks import DepthExtractor, dense_units
 
 SPEC = ObservationSpec(height_px=24, width_px=32, horizontal_fov_deg=90.0, range_m=20.0)
 """Fits the camera of the shipped vehicle `quad`: 64x48 px."""

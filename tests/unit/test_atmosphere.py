@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from airl_mav.core import constants
-from airl_mav.core.location import HOME, MAGNETIC_DECLINATION, MAGNETIC_FIELD_NED
+from airl_mav.core.frames import HOME, MAGNETIC_DECLINATION, MAGNETIC_FIELD_NED
 from airl_mav.vehicle.atmosphere import altitude_m, pressure_hpa, temperature_c
 
 # U.S. Standard Atmosphere 1976 = ISO 2533 below 32 km, by geopotential altitude:

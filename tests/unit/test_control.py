@@ -12,14 +12,20 @@ from hypothesis import strategies as st
 from scipy import signal
 from scipy.spatial.transform import Rotation
 
-from airl_mav.control.attitude import attitude_setpoint, rate_setpoint
+from airl_mav.control.attitude import attitude_setpoint, rate_control, rate_setpoint
 from airl_mav.control.cascade import Output, cascade_tick, filters
 from airl_mav.control.demand import Demand
 from airl_mav.control.gains import Gains, pack, unpack
-from airl_mav.control.low_pass import Biquad, butterworth, filtered, settled, weight
-from airl_mav.control.memory import new_memory, reset_integrals
+from airl_mav.control.memory import (
+    Biquad,
+    butterworth,
+    filtered,
+    new_memory,
+    reset_integrals,
+    settled,
+    weight,
+)
 from airl_mav.control.mixer import mix
-from airl_mav.control.rate import rate_control
 from airl_mav.control.velocity import (
     thrust_from_acceleration,
     velocity_control,

@@ -11,11 +11,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from airl_mav.arena.geometry import Arena, Bounds, Obstacles, Shape
-from airl_mav.camera.equidistant import fisheye_places, fisheye_rays
 from airl_mav.camera.frame import depth_to_z16
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.picture import render_picture
 from airl_mav.camera.primitives import OBSTACLE
+from airl_mav.camera.rays import fisheye_places, fisheye_rays
 from airl_mav.camera.render import render
 from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.core.frames import quat_from_euler, quat_to_matrix

@@ -18,9 +18,9 @@ from airl_mav.camera.primitives import FLOOR, OBSTACLE, SKY
 from airl_mav.camera.render import Motion, Mount
 from airl_mav.core.frames import quat_from_euler, quat_to_matrix
 from airl_mav.profiles.arena import ArenaSpec
+from airl_mav.profiles.camera_kind import PROJECTIONS, Projection
 from airl_mav.profiles.distortion import UNDISTORTED, Distortion
 from airl_mav.profiles.loading import load_profile
-from airl_mav.profiles.projection import PROJECTIONS, Projection
 from tests.support.lenses import BARREL, OPENING, published
 from tests.unit.test_colour import rays_of
 

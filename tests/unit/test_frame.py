@@ -23,9 +23,8 @@ from airl_mav.camera.frame import (
 )
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.errors import UsageError
-from airl_mav.profiles.camera_kind import KINDS, CameraKind
+from airl_mav.profiles.camera_kind import KINDS, PROJECTIONS, CameraKind, Projection
 from airl_mav.profiles.distortion import MOST_COEFFICIENT, UNDISTORTED
-from airl_mav.profiles.projection import PROJECTIONS, Projection
 
 lengths = st.floats(-MOST_PX, MOST_PX)
 focals = st.floats(LEAST_PX, MOST_PX)

@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from airl_mav.core import frames
 from airl_mav.core.constants import EARTH_RADIUS_M
-from airl_mav.core.frames import Geodetic
-from airl_mav.core.location import HOME
+from airl_mav.core.frames import HOME, Geodetic
 from airl_mav.vehicle import rotation as kernels
 
 angles = st.floats(-math.pi, math.pi)

@@ -24,7 +24,7 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import quat_from_euler
 from airl_mav.envs.colour_images import Looks
 from airl_mav.profiles.arena import ArenaSpec
-from airl_mav.profiles.image_file import ImageFile
+from airl_mav.profiles.asset_files import ImageFile
 from airl_mav.profiles.loading import load_profile, profile_digest
 
 PROFILE = """
@@ -125,7 +125,7 @@ def test_images_are_those_of_mitsuba(arena: Arena) -> None:
     camera, attitude = Intrinsics.from_fov(96, 64, 1.5), quat_from_euler(0.03, -0.08, 0.3)
     place, centers = np.array([6.0, -6.0, -3.0]), arena.centers_at(0)
     ours = antialiased(arena, centers, camera, place, attitude, 4).astype(float)
-    theirs = mitsuba.path_traced(arena, centers, camera, place, attitude, samples=48)
+    theirs = mitsuba.PathTracer(48)(arena, centers, camera, place, attitude, 0)
     assert np.abs(ours - theirs).mean() / 255.0 < 0.03
     # Red and blue the other way round are far off: the limit can fail.
     assert np.abs(ours[..., ::-1] - theirs).mean() / 255.0 > 0.05

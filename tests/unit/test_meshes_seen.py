@@ -22,8 +22,8 @@ from airl_mav.camera.render import render
 from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import quat_from_euler, quat_to_matrix
 from airl_mav.profiles.appearance import Appearance
+from airl_mav.profiles.camera_kind import PROJECTIONS, Projection
 from airl_mav.profiles.distortion import UNDISTORTED, sees_to
-from airl_mav.profiles.projection import PROJECTIONS, Projection
 from tests.support.lenses import BARREL, ENDING, OPENING, rays_of_fisheye
 from tests.support.meshes import ROOM, kept, ring, scene_of, triangles
 

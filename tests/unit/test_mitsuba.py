@@ -17,10 +17,10 @@ from airl_mav.arena.appearance import linear_of, srgb_of
 from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.cube_faces import cube_of, resampled
-from airl_mav.camera.equidistant import fisheye_rays
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.mitsuba import path_traced
+from airl_mav.camera.mitsuba import PathTracer
 from airl_mav.camera.picture import antialiased, render_picture
+from airl_mav.camera.rays import fisheye_rays
 from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import quat_from_euler, quat_to_matrix
 from airl_mav.profiles.appearance import Appearance
@@ -48,6 +48,19 @@ PLAIN = {
 }
 
 CAMERA = Intrinsics.from_fov(96, 64, 1.5)
+
+
+def path_traced(
+    scene: Arena,
+    centers: Any,
+    camera: Intrinsics,
+    place: Any,
+    turn: Any,
+    *,
+    samples: int,
+    seed: int = 0,
+) -> NDArray[np.uint8]:
+    return PathTracer(samples)(scene, centers, camera, place, turn, seed)
 
 
 def arena(name: str, seed: int, **appearance: Any) -> Arena:

@@ -17,9 +17,8 @@ from airl_mav.camera.render import Mount, camera_pose, render
 from airl_mav.core.errors import FieldError
 from airl_mav.core.frames import quat_from_euler, quat_to_matrix
 from airl_mav.policy.observation import Kinematics
-from airl_mav.prediction.compensator import LINK_US, Compensator
-from airl_mav.prediction.lateness import REMEMBERED, ExpectedLatency
-from airl_mav.prediction.motion import Motion, flown_on, leaning
+from airl_mav.prediction.compensator import LINK_US, Compensator, Motion, flown_on, leaning
+from airl_mav.prediction.memory import REMEMBERED, ExpectedLatency
 from airl_mav.prediction.reprojection import CameraPose, Reprojector, Sight
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile

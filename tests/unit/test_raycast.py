@@ -24,8 +24,8 @@ from airl_mav.core.frames import (
     quat_multiply,
     quat_to_matrix,
 )
+from airl_mav.profiles.camera_kind import PROJECTIONS, Projection
 from airl_mav.profiles.distortion import UNDISTORTED, sees_to
-from airl_mav.profiles.projection import PROJECTIONS, Projection
 from tests.support.lenses import BARREL, ENDING, OPENING, rays_of_fisheye
 
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])

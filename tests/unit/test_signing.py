@@ -15,12 +15,15 @@ from airl_mav.core.signing import (
     EPOCH_UNIX_US,
     LATE,
     MAX_STREAMS,
+    SAVE_EVERY_US,
     SIGNATURE_BYTES,
     UNIT_US,
     Signing,
+    StoredSigning,
     frames_of,
+    read_key,
+    write_key,
 )
-from airl_mav.core.signing_key import SAVE_EVERY_US, StoredSigning, read_key, write_key
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 from airl_mav.scenario.stand_alone import (

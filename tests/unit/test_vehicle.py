@@ -20,7 +20,7 @@ from airl_mav.core.kernels import kernel
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.vehicle.airframe import Airframe, airframe_of
-from airl_mav.vehicle.battery import drain, open_circuit, terminal_voltage
+from airl_mav.vehicle.power import drain, open_circuit, terminal_voltage
 from airl_mav.vehicle.rigid_body import drag_force, step
 from airl_mav.vehicle.rotation import Quat, Vec
 from airl_mav.vehicle.rotor import hover_speeds, lag, settle, steady_speed, wrench

@@ -36,7 +36,12 @@ def _check(
     component: Component,
     level: Level = Level.ERROR,
     description: str = "",
+    parameters: str = "",
 ) -> CheckEvent:
+    """Return a check; `parameters` configure it, where the description does not say more."""
+    if parameters:
+        named = " and ".join(f"<param>{each}</param>" for each in parameters.split())
+        description = f"Configured by {named}."
     return CheckEvent(
         Definition(name, message, _ABOUT, level, description=description, group="arming_check"),
         component,
@@ -69,10 +74,7 @@ MAG_NO_DATA = _health(
     "check_mag_no_data", "No valid data from Compass {3}", _C.MAGNETOMETER, *_FIRST
 )
 GPS_FIX_TOO_LOW = _check(
-    "check_estimator_gps_fix_too_low",
-    "GPS fix too low",
-    _C.GPS,
-    description="Configured by <param>COM_ARM_WO_GPS</param>.",
+    "check_estimator_gps_fix_too_low", "GPS fix too low", _C.GPS, parameters="COM_ARM_WO_GPS"
 )
 DISTANCE_SENSOR_MISSING = _health(
     "check_distance_sensor_missing", "Distance sensor {3} missing", _C.DISTANCE_SENSOR, *_FIRST
@@ -148,33 +150,30 @@ FENCE_DISTANCE = _check(
     "check_gf_violation_max_hor_dist",
     "Geofence violation: exceeding maximum distance to Home",
     _SYSTEM,
-    description="Configured by <param>GF_ACTION</param> and <param>GF_MAX_HOR_DIST</param>.",
+    parameters="GF_ACTION GF_MAX_HOR_DIST",
 )
 FENCE_ALTITUDE = _check(
     "check_gf_violation_max_alt",
     "Geofence violation: exceeding maximum altitude above Home",
     _SYSTEM,
-    description="Configured by <param>GF_ACTION</param> and <param>GF_MAX_VER_DIST</param>.",
+    parameters="GF_ACTION GF_MAX_VER_DIST",
 )
 FENCE_CUSTOM = _check(
     "check_gf_violation_custom_gf",
     "Geofence violation: approaching or outside geofence",
     _SYSTEM,
-    description="Configured by <param>GF_ACTION</param>.",
+    parameters="GF_ACTION",
 )
 FENCE_NO_HOME = _check("check_gf_no_home", "Geofence RTL requires valid home", _SYSTEM)
 MISSION_FAILURE = _check("check_mission_failure", "Mission cannot be completed", _SYSTEM)
 FLIGHT_TIME = _check(
-    "check_flight_time_limit",
-    "Maximum flight time reached",
-    _SYSTEM,
-    description="Configured by <param>COM_FLT_TIME_MAX</param>.",
+    "check_flight_time_limit", "Maximum flight time reached", _SYSTEM, parameters="COM_FLT_TIME_MAX"
 )
 NO_GCS = _check(
     "check_rc_dl_no_dllink",
     "No connection to the ground control station",
     _C.COMMUNICATION_LINKS,
-    description="Configured by <param>NAV_DLL_ACT</param>.",
+    parameters="NAV_DLL_ACT",
 )
 TERMINATED = _check(
     "check_system_flight_term_active", "Flight termination active", _SYSTEM, _L.CRITICAL
@@ -183,13 +182,10 @@ NO_GLOBAL_POSITION = _check(
     "check_system_no_global_pos",
     "Global position estimate required",
     _SYSTEM,
-    description="Configured by <param>COM_ARM_WO_GPS</param>.",
+    parameters="COM_ARM_WO_GPS",
 )
 NO_HOME = _check(
-    "check_system_no_home_pos",
-    "Home position required",
-    _SYSTEM,
-    description="Configured by <param>COM_ARM_WO_GPS</param>.",
+    "check_system_no_home_pos", "Home position required", _SYSTEM, parameters="COM_ARM_WO_GPS"
 )
 MODE_CANNOT_ARM = _check(
     "check_modes_cannot_takeoff",
@@ -225,11 +221,7 @@ MODE_ALTITUDE = _check(
     _NOT_ENOUGH,
 )
 MODE_MISSION = _check(
-    "check_modes_mission",
-    "No valid mission available",
-    _SYSTEM,
-    _L.INFO,
-    "Upload a mission first.",
+    "check_modes_mission", "No valid mission available", _SYSTEM, _L.INFO, "Upload a mission first."
 )
 MODE_OFFBOARD = _check(
     "check_modes_offboard_signal",

@@ -1,4 +1,4 @@
-"""What an event is: a definition with words, and one that happened, as it goes over the wire.
+"""Events: a definition with words, and one that happened, as it is sent.
 
 Source: https://mavlink.io/en/services/events.html, and PX4 1.16,
 platforms/common/include/px4_platform_common/events.h.
@@ -9,12 +9,10 @@ from __future__ import annotations
 import math
 import struct
 from enum import IntEnum
+from functools import partial
 from typing import NamedTuple
 
 from firmware_sim.autopilot.events.enumerations import ENUMERATIONS
-
-MAX_ARGUMENT_BYTES = 25
-"""PX4's limit for the arguments of an event."""
 
 _AUTOPILOT = 1
 """Component id in the uppermost byte of an event's id."""
@@ -38,7 +36,7 @@ FORMATS = {
 
 
 class Level(IntEnum):
-    """How urgent an event is; nobody is told of PROTOCOL, which is for ground stations' own use."""
+    """Urgency of an event. PROTOCOL is for ground stations' own use."""
 
     EMERGENCY = 0
     ALERT = 1
@@ -116,6 +114,26 @@ def sub_id(name: str) -> int:
 def arguments(*kinds_and_names: str) -> tuple[Argument, ...]:
     """Return arguments of "type name" each."""
     return tuple(Argument(*text.split()) for text in kinds_and_names)
+
+
+def define(
+    name: str,
+    message: str,
+    *listed: str,
+    level: Level = Level.INFO,
+    internal: Level | None = None,
+    description: str = "",
+    kind: str = "",
+) -> Definition:
+    """Return a definition with arguments of "type name" each."""
+    return Definition(
+        name, message, arguments(*listed), level, internal, description=description, kind=kind
+    )
+
+
+critical = partial(define, level=Level.CRITICAL, internal=Level.INFO)
+error = partial(define, level=Level.ERROR, internal=Level.INFO)
+warning = partial(define, level=Level.WARNING, internal=Level.INFO)
 
 
 def _fitted(value: float, of: str) -> float:

@@ -122,7 +122,7 @@ class NavigationMode(IntEnum):
 
 
 class FailsafeAction(IntEnum):
-    """What a failsafe does: the numbers of `failsafes.actions.Action`."""
+    """Actions of a failsafe: the numbers of `failsafes.actions.Action`."""
 
     NONE = 0
     WARN = 1
@@ -156,7 +156,7 @@ class SensorFailure(IntEnum):
 
 
 class FailsafeCause(IntEnum):
-    """What a failsafe's message names as the cause: in the order of `failsafes.actions.Cause`."""
+    """Causes in a failsafe's message: in the order of `failsafes.actions.Cause`."""
 
     GENERIC = 0
     MANUAL_CONTROL_LOSS = 1

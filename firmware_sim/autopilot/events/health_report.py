@@ -33,7 +33,7 @@ MAX_CHECKS = 14
 
 
 class HealthReport(NamedTuple):
-    """What the checks found; equal reports are told once."""
+    """Findings of the checks; equal reports are sent once."""
 
     can_arm: int
     """Bits of the modes in which the vehicle can be armed."""

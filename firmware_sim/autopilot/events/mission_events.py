@@ -6,21 +6,20 @@ navigator/mission_feasibility_checker.cpp, navigator/geofence.cpp, mavlink/mavli
 
 from __future__ import annotations
 
-from firmware_sim.autopilot.events.definition import Definition, Level, arguments
+from firmware_sim.autopilot.events.definition import Definition, Level, define, error, warning
 
 
 def _rejected(name: str, words: str, *listed: str, internal: Level = Level.INFO) -> Definition:
-    message = f"Mission rejected: {words}"
-    return Definition(name, message, arguments(*listed), Level.ERROR, internal)
+    return define(name, f"Mission rejected: {words}", *listed, level=Level.ERROR, internal=internal)
 
 
 def _transfer(name: str, message: str, level: Level = Level.ERROR) -> Definition:
-    return Definition(f"mavlink_mission_{name}", message, level=level)
+    return define(f"mavlink_mission_{name}", message, level=level)
 
 
 # --- what cannot be flown
 
-NO_POSITION = Definition("navigator_mis_no_pos_lock", "Not yet ready for mission, no position lock")
+NO_POSITION = define("navigator_mis_no_pos_lock", "Not yet ready for mission, no position lock")
 UNSUPPORTED_COMMAND = _rejected(
     "navigator_mis_unsup_cmd",
     "item {1}: unsupported command: {2}",
@@ -29,9 +28,7 @@ UNSUPPORTED_COMMAND = _rejected(
 )
 STARTS_WITH_LANDING = _rejected("navigator_mis_starts_w_landing", "starts with landing")
 TAKEOFF_TOO_LOW = _rejected(
-    "navigator_mis_takeoff_too_low",
-    "takeoff altitude too low! Minimum: {1:.1m_v}",
-    "float minimum",
+    "navigator_mis_takeoff_too_low", "takeoff altitude too low! Minimum: {1:.1m_v}", "float minimum"
 )
 TAKEOFF_NOT_FIRST = _rejected(
     "navigator_mis_takeoff_not_first", "takeoff is not the first waypoint item"
@@ -49,30 +46,24 @@ TAKEOFF_OR_LAND_MISSING = _rejected(
 )
 ADD_LANDING = _rejected("navigator_mis_add_land_or_rm_to", "Add Landing item or remove Takeoff")
 ADD_TAKEOFF = _rejected("navigator_mis_add_to_or_rm_land", "Add Takeoff item or remove Landing")
-OUTSIDE_FENCE = Definition(
-    "navigator_mis_geofence_violation",
-    "Geofence violation for waypoint {1}",
-    arguments("int16_t waypoint"),
-    Level.ERROR,
-    Level.INFO,
+OUTSIDE_FENCE = error(
+    "navigator_mis_geofence_violation", "Geofence violation for waypoint {1}", "int16_t waypoint"
 )
-FIRST_FAR_AWAY = Definition(
+FIRST_FAR_AWAY = warning(
     "navigator_mis_first_wp_far",
     "First waypoint far away from Home: {1m} Correct mission loaded?",
-    arguments("uint32_t distance"),
-    Level.WARNING,
-    Level.INFO,
+    "uint32_t distance",
 )
 
 # --- a fence that is left out
 
-FENCE_WITHOUT_HOME = Definition(
+FENCE_WITHOUT_HOME = define(
     "navigator_geofence_invalid_against_home",
     "Geofence invalid, doesn't contain Home position",
     level=Level.CRITICAL,
     internal=Level.WARNING,
 )
-FENCE_WITHOUT_VEHICLE = Definition(
+FENCE_WITHOUT_VEHICLE = define(
     "navigator_geofence_invalid_against_cur_pos",
     "Geofence invalid, doesn't contain current vehicle position",
     level=Level.CRITICAL,
@@ -85,8 +76,7 @@ DOWNLOAD_IGNORED = _transfer(
     "req_ignored", "Mission download request ignored, already active", Level.WARNING
 )
 REQUEST_OF_ANOTHER = _transfer(
-    "partner_id_mismatch2",
-    "Rejecting mission request command, component or system ID mismatch",
+    "partner_id_mismatch2", "Rejecting mission request command, component or system ID mismatch"
 )
 REQUEST_WHILE_BUSY = _transfer("mis_req_ignored_busy", "Ignoring mission request, currently busy")
 REQUEST_UNEXPECTED = _transfer("wp_unexpected", "Unexpected waypoint index, aborting transfer")

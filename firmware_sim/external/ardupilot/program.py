@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from airl_mav.core.location import HOME
+from airl_mav.core.frames import HOME
 from airl_mav.core.ports import LOOPBACK
 from firmware_sim.external.parameter_file import ardupilot_file
 from firmware_sim.external.process import StartCommand

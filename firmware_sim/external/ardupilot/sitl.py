@@ -66,7 +66,7 @@ thousandth of its time."""
 def state_line(time_us: int, sample: SensorSample, truth: Truth) -> bytes:
     """Return the answer to a servo packet: one line, a line feed before and after.
 
-    ArduPilot finds keys by substring and then reads with sscanf: nothing may stand between a key's
+    ArduPilot finds keys by substring and then reads with sscanf. Nothing may stand between a key's
     colon and its bracket, and no key may hold the name of a later one. Numbers are the shortest
     that read back as the same double. From `truth` ArduPilot simulates GPS, barometer and compass.
     """
@@ -109,10 +109,7 @@ class ArdupilotBridge:
     """One ArduPilot, one episode. Implements `bridge.Bridge`."""
 
     def __init__(self, port: int, *, silence_s: float = SILENCE_S) -> None:
-        """Open a loopback UDP port, or raise UsageError; ArduPilot sends first.
-
-        `silence_s` is the longest wait for a packet [wall s].
-        """
+        """Open a loopback UDP port, or raise UsageError; packets may take `silence_s` [wall s]."""
         self.rate_hz = 0
         """What ArduPilot asks for: it arms only with 1.8 times its loop rate (SCHED_LOOP_RATE,
         400 Hz) or more."""

@@ -42,7 +42,6 @@ class Board:
         self.autopilot = 0
         """MAV_AUTOPILOT of its heartbeats."""
         self.beats = 0
-        """Heartbeats received."""
         self.hil = False
         """Whether its newest heartbeat has the HIL flag."""
         self.armed = False
@@ -153,7 +152,7 @@ HIL_BYTES_S = TICK_HZ * SENSOR_BYTES + GPS_HZ * GPS_BYTES
 """What the simulator sends [bytes/s]."""
 
 HIL_SHARE = 2 / 3
-"""Largest share of a line's capacity that this may take: companion and ground station need the
+"""Largest share of a line's capacity that this may take. Companion and ground station need the
 rest."""
 
 USB_CLIENTS_BYTES_S = 100_000
@@ -193,12 +192,10 @@ class BoardLink:
     # --- connecting
 
     def connect(self, timeout_s: float, alive: Callable[[], None], *, returning: bool) -> None:
-        """Return once a board in HIL mode has sent a heartbeat.
+        """Return once a board in HIL mode has sent a heartbeat, at most after `timeout_s` [wall s].
 
-        Args:
-            timeout_s: Timeout [wall s].
-            alive: Called at intervals; raises to give up.
-            returning: Whether the device was there before and may be absent at first.
+        `alive` is called at intervals and raises to give up. If `returning`, the device was there
+        before and may be absent at first.
 
         Raises:
             UsageError: The device cannot be opened.

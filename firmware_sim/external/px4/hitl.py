@@ -1,6 +1,6 @@
 """Hardware in the loop: a PX4 board that flies on simulated sensors over a serial or USB line.
 
-There is no lockstep. The board runs on its own clock; every tick's sensors are sent to it, and its
+There is no lockstep. The board runs on its own clock. Every tick's sensors are sent to it, and its
 newest motor commands are applied, late by a transfer and a cycle of the board.
 
 Source: PX4, src/modules/mavlink: mavlink_receiver.cpp (HIL_SENSOR, HIL_GPS),
@@ -34,7 +34,7 @@ _BEHIND_US = 20_000
 
 
 class Pace:
-    """Limits ticks to 250 per second of wall time: the board's clock is not simulated.
+    """Limits ticks to 250 per second of wall time. The board's clock is not simulated.
 
     Where ticks are paced already, it adapts to the pace of the punctual ones and does not wait.
     """
@@ -62,7 +62,7 @@ class HitlBridge:
     """Flies one board for one episode. Implements `Bridge`.
 
     A lost device, missing or invalid motor commands, a restart or leaving HIL mode end the flight
-    (`FirmwareLostError`). Sensors are sent once HIL mode is reported, HIL_STATE_QUATERNION never: a
+    (`FirmwareLostError`). Sensors are sent once HIL mode is reported, HIL_STATE_QUATERNION never. A
     board takes it for its own estimate.
     """
 

@@ -14,7 +14,7 @@ from firmware_sim.flight_controller import FirmwareMissingError
 SIMULATOR_PORT = 4560
 API_PORT, API_LOCAL_PORT = 14540, 14580
 PAYLOAD_PORT, PAYLOAD_LOCAL_PORT = 14030, 14280
-"""Ports of PX4's instance 0; each further one has the next (px4-rc.simulator, px4-rc.mavlink).
+"""Ports of PX4's instance 0. Each further one has the next (px4-rc.simulator, px4-rc.mavlink).
 Instances above 9 share one API port."""
 
 LOCAL_PORTS = (API_LOCAL_PORT, 18_570, PAYLOAD_LOCAL_PORT, 13_030)

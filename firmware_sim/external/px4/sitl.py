@@ -29,7 +29,7 @@ STOPPED_S = 1.0
 clients miss its heartbeats."""
 
 REST_S = 0.1
-"""Longest wait for one answer of a PX4 that is disarmed [wall s]; then the next sample is sent. In
+"""Longest wait for one answer of a PX4 that is disarmed [wall s]. Then the next sample is sent. In
 Offboard on the ground, without a setpoint, it answers only now and then, by its own clock, which
 does not advance while it is waited for."""
 
@@ -76,24 +76,18 @@ class Px4Bridge:
         start_s: float = START_S,
         least_state_us: int = 1,
     ) -> None:
-        """Listen for PX4, or raise UsageError.
+        """Listen for PX4 on TCP port 4560 + instance, 0 = any free one, or raise UsageError.
 
-        Args:
-            port: TCP port: 4560 + instance, 0 = any free one.
-            answer_s: Timeout of an answer [wall s].
-            start_s: Timeout of the first one [wall s].
-            least_state_us: Minimum interval of the true state [µs].
+        `answer_s` and `start_s` are the timeouts of an answer and of the first one [wall s],
+        `least_state_us` the minimum interval of the true state.
         """
         self._least_state_us = least_state_us
         self.armed = False
         self.time_us = 0
         self.unanswered = 0
-        """Samples sent before PX4's first answer."""
         self.duplicates = 0
-        """Answers beyond the first to a sample."""
         self._tcp = TcpPort(port)
         self.port = self._tcp.port
-        """The port it listens on."""
         self._answer_s, self._start_s = answer_s, start_s
         self._clock = WallClock()
         self._alive: Callable[[], None] = no_process
@@ -133,7 +127,7 @@ class Px4Bridge:
     def settle(self) -> None:
         """Return once PX4 has done all that is due by its clock, as far as that can be seen.
 
-        Controllers and estimator are done when it answers a sample; other threads may lag on a busy
+        Controllers and estimator are done when it answers a sample. Other threads may lag on a busy
         host.
         """
         if self._program is not None and self._answer is not None:

@@ -1,6 +1,6 @@
 """Router of MAVLink between a board on one serial line and its clients over UDP.
 
-Simulator messages on the line are handled here; all other frames are forwarded unchanged.
+Simulator messages on the line are handled here. All other frames are forwarded unchanged.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Sensor calibration, as a PX4 SITL goes through it: texts that ground stations follow.
 
 The simulated sensors are calibrated from the start, so nothing is estimated. What is real is what a
-client sees: a calibration is refused while the vehicle is armed or another one runs, it fails when
+client sees. A calibration is refused while the vehicle is armed or another one runs, it fails when
 the vehicle moves, it takes its time, and one that needs the vehicle turned by hand waits until it
 is cancelled. Source: PX4 1.16, Commander::handle_command and what a running SITL said.
 """
@@ -16,9 +16,8 @@ from firmware_sim.autopilot.autopilot_state import Arming, Message, Result, Seve
 from firmware_sim.autopilot.events import command_events as events
 from firmware_sim.interfaces import SensorSample
 from firmware_sim.mavlink.codec import dialect
-from firmware_sim.mavlink.services.command import Action, Command
-from firmware_sim.mavlink.services.context import Context
-from firmware_sim.mavlink.services.running_calibration import Step
+from firmware_sim.mavlink.services.context import Action, Command, Context
+from firmware_sim.mavlink.services.transfers import Step
 
 MOVING_RAD_S = 0.2
 """A body rate that counts as motion [rad/s]."""

@@ -2,7 +2,7 @@
 
 Answers and refusals follow PX4's Commander.cpp and mavlink_receiver.cpp, checked against a
 running PX4 1.16. A command addressed to the vehicle is acknowledged to its sender, on the link it
-came from; the same command may come twice (clients repeat), so actions are idempotent. A service
+came from. The same command may come twice (clients repeat), so actions are idempotent. A service
 with commands has a table `ACTIONS` of its own, which is taken into the one here.
 """
 
@@ -14,31 +14,33 @@ from operator import attrgetter
 from firmware_sim.autopilot.autopilot_state import Message, Mode, Result, Severity
 from firmware_sim.autopilot.events import command_events as events
 from firmware_sim.mavlink.codec import WireMessage, dialect
+from firmware_sim.mavlink.px4_custom_mode import requested_mode
 from firmware_sim.mavlink.services import (
     calibration,
     failure,
     logs,
     message_requests,
-    mission_commands,
     navigation_commands,
-    parameter_storage,
-    standard_modes,
+    params,
     without_effect,
 )
-from firmware_sim.mavlink.services.command import Action, Command
 from firmware_sim.mavlink.services.context import (
     ANY,
+    Action,
+    Command,
     Context,
     for_vehicle,
     sender,
 )
 from firmware_sim.mavlink.services.navigation_commands import local_place
-from firmware_sim.mavlink.services.standard_modes import change_mode
-from firmware_sim.mavlink.services.termination import terminate
+from firmware_sim.mavlink.streams.flight_modes import KNOWN
 from firmware_sim.mavlink.streams.units import INT32_MAX
 
 FORCE_MAGIC = 21_196
 """MAV_CMD_COMPONENT_ARM_DISARM param2 that skips the checks."""
+
+TERMINATE_FROM = 0.5
+"""Parameter 1 must exceed this; a termination cannot be undone (PX4: DENIED)."""
 
 # Names made anew for each message would stay in the interpreter's cache of attributes.
 _PARAMS = attrgetter(*(f"param{number}" for number in range(1, 8)))
@@ -81,9 +83,36 @@ def _takeoff(command: Command, context: Context) -> Result:
     return context.port.takeoff(altitude - home.altitude_m, place)
 
 
+def _change_mode(base: int, main: int, sub: int, context: Context) -> Result:
+    """Change the mode: MAV_MODE_FLAG bits, PX4's main and sub mode."""
+    request = requested_mode(base, main, sub)
+    if isinstance(request, Message):
+        context.announce(request)
+        return Result.TEMPORARILY_REJECTED
+    return Result.ACCEPTED if request is None else context.port.set_mode(request)
+
+
+def _set_standard_mode(command: Command, context: Context) -> Result:
+    """Parameter 1: MAV_STANDARD_MODE; FAILED for one that a multicopter does not have."""
+    asked = command.integer(1) or 0
+    if asked != dialect.MAV_STANDARD_MODE_NON_STANDARD:
+        for known in KNOWN:
+            if known.standard == asked:
+                return _change_mode(
+                    dialect.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED, known.main, known.sub, context
+                )
+    return Result.FAILED
+
+
 def _set_mode(command: Command, context: Context) -> Result:
     base, main, sub = (command.integer(number) or 0 for number in (1, 2, 3))
-    return change_mode(base, main, sub, context)
+    return _change_mode(base, main, sub, context)
+
+
+def _terminate(command: Command, context: Context) -> Result:
+    """DO_FLIGHTTERMINATION: stop the motors for good; DENIED unless the vehicle is armed (PX4)."""
+    wanted = command.params[0] > TERMINATE_FROM
+    return context.port.terminate() if wanted else Result.DENIED
 
 
 def _run_checks(_command: Command, context: Context) -> Result:
@@ -112,17 +141,16 @@ ACTIONS: dict[int, Action] = {
     dialect.MAV_CMD_NAV_LAND_LOCAL: _mode(Mode.PRECISION_LAND),
     dialect.MAV_CMD_NAV_RETURN_TO_LAUNCH: _mode(Mode.RETURN),
     dialect.MAV_CMD_DO_SET_MODE: _set_mode,
-    dialect.MAV_CMD_DO_FLIGHTTERMINATION: terminate,
+    dialect.MAV_CMD_DO_SET_STANDARD_MODE: _set_standard_mode,
+    dialect.MAV_CMD_DO_FLIGHTTERMINATION: _terminate,
     dialect.MAV_CMD_RUN_PREARM_CHECKS: _run_checks,
     dialect.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: _reboot,
     **failure.ACTIONS,
     **logs.ACTIONS,
     **message_requests.ACTIONS,
     **calibration.ACTIONS,
-    **mission_commands.ACTIONS,
     **navigation_commands.ACTIONS,
-    **parameter_storage.ACTIONS,
-    **standard_modes.ACTIONS,
+    **params.ACTIONS,
     **without_effect.ACTIONS,
 }
 """Everything else is UNSUPPORTED."""
@@ -147,7 +175,7 @@ def handle_set_mode(message: WireMessage, context: Context) -> bool:
     if message.target_system != context.system_id:
         return False
     main, sub = message.custom_mode >> 16 & 0xFF, message.custom_mode >> 24 & 0xFF
-    change_mode(message.base_mode, main, sub, context)
+    _change_mode(message.base_mode, main, sub, context)
     return True
 
 

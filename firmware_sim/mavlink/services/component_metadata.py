@@ -12,15 +12,24 @@ import functools
 import json
 import lzma
 import math
+from collections.abc import Iterator
 from typing import Any
 
 from airl_mav.profiles.parameters import SPECS, ParameterSpec
 from firmware_sim.autopilot.autopilot_state import Result
+from firmware_sim.autopilot.events import (
+    check_events,
+    command_events,
+    flight_events,
+    mission_events,
+)
+from firmware_sim.autopilot.events.check_events import CheckEvent
+from firmware_sim.autopilot.events.definition import Definition, sub_id
+from firmware_sim.autopilot.events.enumerations import ENUMERATIONS, Enumeration, ModeGroup, words
+from firmware_sim.autopilot.mode_numbers import STATE_BITS, custom_mode
 from firmware_sim.mavlink.codec import dialect
 from firmware_sim.mavlink.crc32 import crc32part
-from firmware_sim.mavlink.services import event_metadata
-from firmware_sim.mavlink.services.command import Command
-from firmware_sim.mavlink.services.context import Context
+from firmware_sim.mavlink.services.context import Command, Context
 from firmware_sim.mavlink.streams.units import boot_ms
 from firmware_sim.storage import Storage
 
@@ -32,8 +41,8 @@ _EVENTS = "all_events.json.xz"
 @functools.cache
 def files() -> dict[str, bytes]:
     """Return the files by their names; made when they are first wanted."""
-    parameters = _compressed({"version": 1, "parameters": [_described(s) for s in SPECS]})
-    events = _compressed(event_metadata.document())
+    parameters = _compressed({"version": 1, "parameters": [_parameter_described(s) for s in SPECS]})
+    events = _compressed(_event_document())
     entries = [
         {"type": kind, "uri": f"mftp://{_FOLDER}/{name}", "fileCrc": crc32part(data)}
         for kind, name, data in (
@@ -86,7 +95,7 @@ def _compressed(document: dict[str, Any]) -> bytes:
     return lzma.compress(data, format=lzma.FORMAT_XZ, check=lzma.CHECK_CRC32)
 
 
-def _described(spec: ParameterSpec) -> dict[str, Any]:
+def _parameter_described(spec: ParameterSpec) -> dict[str, Any]:
     whole = isinstance(spec.default, int)
     kind = int if whole else float
     described: dict[str, Any] = {
@@ -104,3 +113,67 @@ def _described(spec: ParameterSpec) -> dict[str, Any]:
         if math.isfinite(limit)
     }
     return described
+
+
+# --- the words of events (https://github.com/mavlink/libevents, `validation/schema.json`)
+
+
+def definitions() -> Iterator[Definition]:
+    """Yield every event that this vehicle can send."""
+    for module in (flight_events, mission_events, command_events, check_events):
+        for value in vars(module).values():
+            if isinstance(value, Definition):
+                yield value
+            elif isinstance(value, CheckEvent):
+                yield value.definition
+
+
+def _event_document() -> dict[str, Any]:
+    """Return the content of the file with the words of events."""
+    groups: dict[str, dict[str, Any]] = {}
+    for definition in definitions():
+        group = groups.setdefault(definition.group, {"events": {}})
+        group["events"][str(sub_id(definition.name))] = _event_described(definition)
+    component = {
+        "namespace": "px4",
+        "enums": {name: _enumeration(listed) for name, listed in ENUMERATIONS.items()},
+        "event_groups": groups,
+        "navigation_mode_groups": {"groups": _modes_of_groups()},
+        "supported_protocols": ["health_and_arming_check"],
+    }
+    return {"version": 2, "components": {"1": component}}
+
+
+def _event_described(definition: Definition) -> dict[str, Any]:
+    described: dict[str, Any] = {"name": definition.name, "message": definition.message}
+    if definition.kind:
+        described["type"] = definition.kind
+    if definition.description:
+        described["description"] = definition.description
+    if definition.arguments:
+        described["arguments"] = [
+            {"type": argument.kind, "name": argument.name} for argument in definition.arguments
+        ]
+    return described
+
+
+def _enumeration(listed: Enumeration) -> dict[str, Any]:
+    described: dict[str, Any] = {"type": listed.base, "description": listed.meaning}
+    if listed.bitfield:
+        described["is_bitfield"] = True
+    described["entries"] = {
+        str(member.value): {"name": member.name.lower(), "description": words(member)}
+        for member in listed.members
+    }
+    return described
+
+
+def _modes_of_groups() -> dict[str, list[int]]:
+    """Return the custom modes that each bit of a check stands for."""
+    groups = {group.value for group in ModeGroup}
+    lowest = {mode: bits & -bits for mode, bits in STATE_BITS.items()}
+    return {
+        str(bit.bit_length() - 1): [custom_mode(mode)]
+        for mode, bit in lowest.items()
+        if bit in groups
+    }

@@ -1,22 +1,27 @@
-"""What a service may use while it handles a message."""
+"""Context of the handlers: a client, its link, the autopilot, and shared state."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from airl_mav.core.signing import Signing
-from firmware_sim.autopilot.autopilot_state import Message
+from firmware_sim.autopilot.autopilot_state import Message, Result
 from firmware_sim.autopilot.port import AutopilotPort
 from firmware_sim.mavlink.codec import COMPONENT_ID, SYSTEM_ID, WireMessage
 from firmware_sim.mavlink.event_buffer import EventBuffer
 from firmware_sim.mavlink.link import Link
 from firmware_sim.mavlink.radio import Radio
-from firmware_sim.mavlink.services.ftp_session import FtpClient
-from firmware_sim.mavlink.services.log_transfer import LogDownload, LogListing, LogStream
-from firmware_sim.mavlink.services.mission_transfer import MissionTransfer
-from firmware_sim.mavlink.services.running_calibration import RunningCalibration
-from firmware_sim.mavlink.services.shell_session import Shell
+from firmware_sim.mavlink.services.transfers import (
+    FtpClient,
+    LogDownload,
+    LogListing,
+    LogStream,
+    MissionTransfer,
+    RunningCalibration,
+    Shell,
+)
 from firmware_sim.storage import Storage
 
 ANY = 0
@@ -25,45 +30,38 @@ ANY = 0
 
 @dataclass(slots=True)
 class Context:
-    """What a handler may use for one client; the server updates `now_us` for every message."""
+    """State of one client for its handlers. The server updates `now_us` for every message.
+
+    Events, signing, storage, calibration and radio are the vehicle's, the same for all clients.
+    """
 
     link: Link
-    """Answers and streams of the client that asks, and of nobody else."""
+    """Answers and streams of this client."""
     port: AutopilotPort
     now_us: int
     """Simulated time [µs]."""
     announce: Callable[[Message], None]
-    """Sends a text to the operators, to all clients of all links; and its event, if it is one.
-    Events are part of the telemetry: where an answer to a client must not change that, in lockstep,
+    """Sends a text, with its event if it has one, to all clients of all links.
+    Events are part of the telemetry. Where an answer to a client must not change that, in lockstep,
     it is a text alone."""
     broadcast: Callable[[str, bytes], None]
     """Sends a message, by its name and payload, to all clients of all links."""
     events: EventBuffer
-    """The newest events, the same for all clients."""
     signing: Signing
     """The key of all links, if there is one."""
     system_id: int = SYSTEM_ID
-    """Of this vehicle."""
     next_parameter: int | None = None
     """Index that a running parameter list sends next; -1 = the hash; None = no list is running."""
     transfer: MissionTransfer = field(default_factory=MissionTransfer)
-    """The link's part in the mission protocol."""
     storage: Storage = field(default_factory=Storage)
-    """The vehicle's files, the same for all clients."""
     ftp: FtpClient = field(default_factory=FtpClient)
-    """The client's part in MAVLink FTP."""
     shell: Shell = field(default_factory=Shell)
-    """The client's part in the shell."""
     calibration: RunningCalibration = field(default_factory=RunningCalibration)
-    """The vehicle's, the same for all clients."""
     radio: Radio = field(default_factory=Radio)
-    """The newest channels of a radio, the same for all clients."""
+    """Newest channels of a radio."""
     log_listing: LogListing | None = None
-    """The entries of logs that are still to be sent."""
     log_download: LogDownload | None = None
-    """The part of a log that is still to be sent."""
     log_stream: LogStream | None = None
-    """The log that is sent while it is written."""
     refusals: set[str] = field(default_factory=set)
     """Why setpoints have been refused since the last one that was accepted."""
 
@@ -82,6 +80,12 @@ class Context:
             or self.log_stream is not None
         )
 
+    def announce_once(self, refusal: Message) -> None:
+        """Announce why a message is refused, unless that was announced already."""
+        if refusal.text not in self.refusals:
+            self.refusals.add(refusal.text)
+            self.announce(refusal)
+
     def close(self) -> None:
         """Release what is held for the client: it has gone, or another autopilot comes."""
         self.ftp.close()
@@ -90,8 +94,7 @@ class Context:
 def for_vehicle(message: WireMessage, context: Context) -> bool:
     """Return whether a message is addressed to this vehicle, its autopilot or all components."""
     system: int = message.target_system
-    component: int = message.target_component
-    return system == context.system_id and component in (COMPONENT_ID, ANY)
+    return system == context.system_id and message.target_component in (COMPONENT_ID, ANY)
 
 
 def for_vehicle_or_all(message: WireMessage, context: Context) -> bool:
@@ -104,3 +107,24 @@ def for_vehicle_or_all(message: WireMessage, context: Context) -> bool:
 def sender(message: WireMessage) -> tuple[int, int]:
     """Return the system and component id of a message's sender."""
     return message.get_srcSystem(), message.get_srcComponent()
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """A COMMAND_LONG or COMMAND_INT."""
+
+    number: int
+    params: tuple[float, float, float, float, float, float, float]
+    """Parameters 1..7 of COMMAND_LONG; NaN = not given."""
+    sender: tuple[int, int] = (0, 0)
+    frame: int | None = None
+    """MAV_FRAME of a COMMAND_INT."""
+
+    def integer(self, number: int) -> int | None:
+        """Return parameter 1..7 rounded, None when it is not a finite number."""
+        value = self.params[number - 1]
+        return round(value) if math.isfinite(value) else None
+
+
+Action = Callable[[Command, Context], "Result | None"]
+"""Carries out a command and returns the answer; None: it is not acknowledged, as by PX4."""

@@ -10,8 +10,7 @@ from airl_mav.faults.kinds import MOTORS, Part
 from airl_mav.faults.model import Fault
 from firmware_sim.autopilot.autopilot_state import Result
 from firmware_sim.mavlink.codec import dialect
-from firmware_sim.mavlink.services.command import Action, Command
-from firmware_sim.mavlink.services.context import Context
+from firmware_sim.mavlink.services.context import Action, Command, Context
 
 ENABLED = "SYS_FAILURE_EN"
 

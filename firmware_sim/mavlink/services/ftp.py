@@ -15,7 +15,7 @@ from firmware_sim.mavlink.codec import WireMessage
 from firmware_sim.mavlink.services import component_metadata
 from firmware_sim.mavlink.services.context import Context, sender
 from firmware_sim.mavlink.services.ftp_files import DATA_BYTES, OPERATIONS, Checksum, read_at
-from firmware_sim.mavlink.services.ftp_session import (
+from firmware_sim.mavlink.services.transfers import (
     SESSION,
     Burst,
     Code,
@@ -85,7 +85,7 @@ def handle_request(message: WireMessage, context: Context) -> bool:
 
 
 class Answered(NamedTuple):
-    """What an answer says of its request."""
+    """Fields of an answer about its request."""
 
     sequence: int
     session: int

@@ -1,4 +1,4 @@
-"""What MAVLink FTP does with files: one function per request, on the vehicle's storage.
+"""File operations of MAVLink FTP: one function per request, on the vehicle's storage.
 
 Requests, answers and error codes: https://mavlink.io/en/services/ftp.html, and what a running PX4
 1.16 (MavlinkFTP) answers. Like PX4's, a session has the number 0, and each client has one.
@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from firmware_sim.mavlink.crc32 import crc32part
-from firmware_sim.mavlink.services.ftp_session import Code, RefusedError, Request, Session
+from firmware_sim.mavlink.services.transfers import Code, RefusedError, Request, Session
 from firmware_sim.storage import Storage
 
 DATA_BYTES = 239

@@ -10,9 +10,8 @@ import struct
 
 from firmware_sim.autopilot.autopilot_state import Message, Result, Severity
 from firmware_sim.mavlink.codec import WireMessage, dialect
-from firmware_sim.mavlink.services.command import Action, Command
-from firmware_sim.mavlink.services.context import Context
-from firmware_sim.mavlink.services.log_transfer import (
+from firmware_sim.mavlink.services.context import Action, Command, Context
+from firmware_sim.mavlink.services.transfers import (
     PIECE_BYTES,
     LogDownload,
     LogListing,

@@ -1,7 +1,7 @@
 """Messages on request, and how often they are streamed.
 
 REQUEST_MESSAGE, SET_MESSAGE_INTERVAL, GET_MESSAGE_INTERVAL and their older kin, answered as a
-running PX4 1.16 answers them: a message that has nothing to say is DENIED, the rate of one that is
+running PX4 1.16 answers them. A message that has nothing to say is DENIED, the rate of one that is
 no stream FAILED.
 """
 
@@ -11,12 +11,13 @@ import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 
+from airl_mav.core.constants import US_PER_S
 from firmware_sim.autopilot.autopilot_state import Result
-from firmware_sim.mavlink.codec import dialect, message_name
+from firmware_sim.mavlink.codec import WireMessage, dialect, message_name
+from firmware_sim.mavlink.event_buffer import KEPT, NUMBERS, message
 from firmware_sim.mavlink.scheduler import OFF
 from firmware_sim.mavlink.services import component_metadata
-from firmware_sim.mavlink.services.command import Action, Command
-from firmware_sim.mavlink.services.context import Context
+from firmware_sim.mavlink.services.context import Action, Command, Context
 from firmware_sim.mavlink.streams import flight_modes
 from firmware_sim.mavlink.streams.units import INT32_MAX, boot_ms
 
@@ -27,10 +28,27 @@ _MIB = 1024.0 * 1024.0
 FIXED_RATE = frozenset(("HEARTBEAT", "MISSION_CURRENT"))
 """Messages that PX4 sends at rates of its own: no client can change them."""
 
-
 OF_MISSING_DEVICES = frozenset((370, 371))
 """BATTERY_INFO and FUEL_STATUS, which no definitions here have: PX4 accepts a rate, and as it lacks
 the devices, sends nothing. A NaN for an id is accepted likewise."""
+
+
+GROUPS: dict[int, tuple[str, ...]] = {
+    dialect.MAV_DATA_STREAM_RAW_SENSORS: ("HIGHRES_IMU", "SCALED_PRESSURE", "GPS_RAW_INT"),
+    dialect.MAV_DATA_STREAM_EXTENDED_STATUS: (
+        "SYS_STATUS",
+        "EXTENDED_SYS_STATE",
+        "MISSION_CURRENT",
+        "BATTERY_STATUS",
+    ),
+    dialect.MAV_DATA_STREAM_RC_CHANNELS: ("SERVO_OUTPUT_RAW",),
+    dialect.MAV_DATA_STREAM_RAW_CONTROLLER: ("ATTITUDE_TARGET", "POSITION_TARGET_LOCAL_NED"),
+    dialect.MAV_DATA_STREAM_POSITION: ("LOCAL_POSITION_NED", "GLOBAL_POSITION_INT"),
+    dialect.MAV_DATA_STREAM_EXTRA1: ("ATTITUDE",),
+    dialect.MAV_DATA_STREAM_EXTRA2: ("VFR_HUD",),
+    dialect.MAV_DATA_STREAM_EXTRA3: ("SYSTEM_TIME", "ESTIMATOR_STATUS", "VIBRATION"),
+}
+"""Streams of the groups of REQUEST_DATA_STREAM."""
 
 
 def _set_message_interval(command: Command, context: Context) -> Result:
@@ -116,10 +134,7 @@ _SPECIAL: Mapping[int, Callable[[Command, Context], Result]] = {
 
 
 def send_stream(name: str, context: Context) -> Result:
-    """Send one of the streamed messages now; DENIED when it has nothing to say.
-
-    UNSUPPORTED for a message that there is not.
-    """
+    """Send a streamed message now; DENIED: nothing to say, UNSUPPORTED: no such message."""
     if name not in context.link.builders:
         return Result.UNSUPPORTED
     sent = context.link.send_stream(name, context.port.state())
@@ -141,20 +156,63 @@ def _send_interval(number: int, context: Context) -> Result:
     return Result.ACCEPTED
 
 
+def handle_data_stream(message: WireMessage, context: Context) -> bool:
+    """REQUEST_DATA_STREAM: raise the rates of a group of streams, or restore its default rates.
+
+    A real PX4 ignores this deprecated message. It may only raise rates: MAVProxy asks for all
+    streams at 4 Hz when it connects, and another client on the same link must keep its 100 Hz
+    attitude.
+    """
+    if message.req_stream_id == dialect.MAV_DATA_STREAM_ALL:
+        names = tuple(name for group in GROUPS.values() for name in group)
+    else:
+        names = GROUPS.get(message.req_stream_id, ())
+    scheduler = context.link.scheduler
+    start = message.start_stop == 1 and message.req_message_rate > 0
+    for name in names:
+        if not start:
+            scheduler.set_interval(name, scheduler.default_us(name), context.now_us)
+            continue
+        asked_us = US_PER_S // message.req_message_rate
+        present_us = scheduler.interval_us(name)
+        if present_us == OFF or max(asked_us, 1) < present_us:
+            scheduler.set_interval(name, max(asked_us, 1), context.now_us)
+    return bool(names)
+
+
+def handle_event(request: WireMessage, context: Context) -> bool:
+    """REQUEST_EVENT: send events again; RESPONSE_EVENT_ERROR for each that is gone."""
+    first, last = request.first_sequence, request.last_sequence
+    # The first one that is gone tells where to go on: naming thousands would help nobody.
+    wanted = min((last - first) % NUMBERS + 1, KEPT)
+    for number in range(first, first + wanted):
+        sequence = number % NUMBERS
+        sent = context.events.get(sequence)
+        if sent is not None:
+            context.link.send(message(sent))
+            continue
+        context.link.send(
+            dialect.MAVLink_response_event_error_message(
+                *(request.get_srcSystem(), request.get_srcComponent(), sequence),
+                *(context.events.after(sequence), dialect.MAV_EVENT_ERROR_REASON_UNAVAILABLE),
+            )
+        )
+    return True
+
+
+def _sends(name: str) -> Action:
+    """Return the action that sends a stream's message."""
+    return lambda _, context: send_stream(name, context)
+
+
 ACTIONS: dict[int, Action] = {
     dialect.MAV_CMD_SET_MESSAGE_INTERVAL: _set_message_interval,
     dialect.MAV_CMD_GET_MESSAGE_INTERVAL: _get_message_interval,
     dialect.MAV_CMD_REQUEST_MESSAGE: _request_message,
-    dialect.MAV_CMD_GET_HOME_POSITION: lambda _, context: send_stream("HOME_POSITION", context),
-    dialect.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: (
-        lambda _, context: send_stream("AUTOPILOT_VERSION", context)
-    ),
-    dialect.MAV_CMD_REQUEST_PROTOCOL_VERSION: (
-        lambda _, context: send_stream("PROTOCOL_VERSION", context)
-    ),
-    dialect.MAV_CMD_REQUEST_FLIGHT_INFORMATION: (
-        lambda _, context: send_stream("FLIGHT_INFORMATION", context)
-    ),
+    dialect.MAV_CMD_GET_HOME_POSITION: _sends("HOME_POSITION"),
+    dialect.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: _sends("AUTOPILOT_VERSION"),
+    dialect.MAV_CMD_REQUEST_PROTOCOL_VERSION: _sends("PROTOCOL_VERSION"),
+    dialect.MAV_CMD_REQUEST_FLIGHT_INFORMATION: _sends("FLIGHT_INFORMATION"),
     dialect.MAV_CMD_REQUEST_STORAGE_INFORMATION: (
         lambda command, context: _request_storage(_first_as_second(command), context)
     ),

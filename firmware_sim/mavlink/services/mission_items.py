@@ -1,7 +1,7 @@
 """Plan items on the wire: MISSION_ITEM and MISSION_ITEM_INT to and from `plan.PlanItem`.
 
-What is stored of an item, what is refused and what a download returns follow PX4 1.16
-(MavlinkMissionManager::parse_mavlink_mission_item, format_mavlink_mission_item).
+Stored fields, rejections and downloads follow PX4 1.16.
+Source: MavlinkMissionManager::parse_mavlink_mission_item, format_mavlink_mission_item.
 """
 
 from __future__ import annotations

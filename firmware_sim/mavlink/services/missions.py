@@ -15,7 +15,7 @@ from firmware_sim.autopilot.navigation.plan import MOST_ITEMS, Kind
 from firmware_sim.mavlink.codec import COMPONENT_ID, WireMessage, dialect
 from firmware_sim.mavlink.services import mission_items
 from firmware_sim.mavlink.services.context import ANY, Context, sender
-from firmware_sim.mavlink.services.mission_transfer import (
+from firmware_sim.mavlink.services.transfers import (
     RETRY_US,
     TIMEOUT_US,
     Activity,

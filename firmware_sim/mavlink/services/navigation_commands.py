@@ -1,7 +1,7 @@
-"""Commands that send the vehicle somewhere: to a place, round a place, at a speed.
+"""Commands to fly somewhere, missions, home, origin, and the region of interest.
 
 Source: PX4 1.16, Commander.cpp and Navigator, checked against a running one. PX4 does not look
-at the frame: every altitude is above mean sea level. MAVSDK relies on it, whose do_orbit sends such
+at the frame. Every altitude is above mean sea level. MAVSDK relies on it, whose do_orbit sends such
 an altitude in a frame above home.
 """
 
@@ -13,15 +13,20 @@ from dataclasses import replace
 from airl_mav.core.frames import Geodetic, geodetic_to_local
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.autopilot_state import Message, Mode, Result, Severity
+from firmware_sim.autopilot.navigation.plan import NavCommand
 from firmware_sim.autopilot.requests import OrbitRequest, Place, Reposition
-from firmware_sim.mavlink.codec import dialect
-from firmware_sim.mavlink.services.command import Action, Command
-from firmware_sim.mavlink.services.context import Context
+from firmware_sim.mavlink.codec import WireMessage, dialect
+from firmware_sim.mavlink.services.context import Action, Command, Context
 
 NAN = math.nan
 
 _CHANGE_MODE: int = dialect.MAV_DO_REPOSITION_FLAGS_CHANGE_MODE
 _GROUND_SPEED: int = dialect.SPEED_TYPE_GROUNDSPEED
+_ROI_LOCATION = 3
+"""MAV_ROI_LOCATION."""
+
+_LOWEST_M, _HIGHEST_M = -12_000.0, 100_000.0
+"""An origin lies between these altitudes above mean sea level, as in EKF2 [m]."""
 
 
 def _reposition(command: Command, context: Context) -> Result:
@@ -78,9 +83,74 @@ def local_place(command: Command, context: Context) -> Vec:
     return north, east, down
 
 
+def _start(command: Command, context: Context) -> Result:
+    """Parameter 1: the first item; -1 = as the mission stands."""
+    index = command.params[0]
+    if not math.isfinite(index):
+        return Result.DENIED
+    return context.port.start_mission(int(index))
+
+
+def _start_landing(_command: Command, context: Context) -> Result:
+    """Go to the mission's landing: DO_LAND_START, or the first landing; CANCELLED without one."""
+    commands = [item.command for item in context.port.plans.mission]
+    for marker in (NavCommand.DO_LAND_START, NavCommand.LAND):
+        if marker in commands:
+            return context.port.start_mission(commands.index(marker))
+    return Result.CANCELLED
+
+
+def _set_home(command: Command, context: Context) -> Result:
+    """Parameter 1: 1 = the present place; else parameters 5 to 7 are the place."""
+    if command.params[0] > 0.5:
+        return context.port.set_home(None)
+    place = Geodetic(*command.params[4:7])
+    if not all(math.isfinite(value) for value in place):
+        return Result.DENIED
+    return context.port.set_home(place)
+
+
+def _look(command: Command, context: Context) -> Result:
+    """DO_SET_ROI_LOCATION, DO_SET_ROI (parameter 1: MAV_ROI) and DO_SET_ROI_NONE."""
+    place = Geodetic(*command.params[4:7])
+    located = command.number == NavCommand.DO_SET_ROI_LOCATION or (
+        command.number != NavCommand.DO_SET_ROI_NONE and command.params[0] == _ROI_LOCATION
+    )
+    valid = math.isfinite(place.latitude_deg) and math.isfinite(place.longitude_deg)
+    context.port.look_at(place if located and valid else None)
+    return Result.ACCEPTED
+
+
+def handle_set_origin(message: WireMessage, context: Context) -> bool:
+    """SET_GPS_GLOBAL_ORIGIN: move local NED's zero, if this vehicle and a valid place are meant.
+
+    Like PX4 1.16, answer any sender with GPS_GLOBAL_ORIGIN.
+    """
+    meant: bool = message.target_system == context.system_id
+    place = Geodetic(message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3)
+    if meant and _is_on_the_globe(place):
+        context.port.set_origin(place)
+    context.link.send_stream("GPS_GLOBAL_ORIGIN", context.port.state())
+    return meant
+
+
+def _is_on_the_globe(place: Geodetic) -> bool:
+    latitude, longitude, altitude = place
+    return abs(latitude) <= 90.0 and abs(longitude) <= 180.0 and _LOWEST_M < altitude < _HIGHEST_M
+
+
 ACTIONS: dict[int, Action] = {
     dialect.MAV_CMD_DO_REPOSITION: _reposition,
     dialect.MAV_CMD_DO_CHANGE_ALTITUDE: _change_altitude,
     dialect.MAV_CMD_DO_CHANGE_SPEED: _change_speed,
     dialect.MAV_CMD_DO_ORBIT: _orbit,
+    dialect.MAV_CMD_MISSION_START: _start,
+    dialect.MAV_CMD_DO_LAND_START: _start_landing,
+    dialect.MAV_CMD_DO_SET_HOME: _set_home,
+    dialect.MAV_CMD_DO_SET_ROI_LOCATION: _look,
+    dialect.MAV_CMD_DO_SET_ROI_NONE: _look,
+    dialect.MAV_CMD_DO_SET_ROI: _look,
+    dialect.MAV_CMD_NAV_ROI: _look,
+    # It is followed only as a mission's item.
+    dialect.MAV_CMD_DO_SET_ROI_WPNEXT_OFFSET: _look,
 }

@@ -6,10 +6,11 @@ import functools
 import math
 import struct
 
+from firmware_sim.autopilot.autopilot_state import Arming, Result
 from firmware_sim.autopilot.port import ParameterStore, ParameterValue
 from firmware_sim.mavlink.codec import WireMessage, dialect, param_value, payload
 from firmware_sim.mavlink.crc32 import crc32part
-from firmware_sim.mavlink.services.context import Context, sender
+from firmware_sim.mavlink.services.context import Action, Command, Context, sender
 
 HASH_NAME = "_HASH_CHECK"
 """Pseudo parameter: a checksum by which a ground station recognises its cached values."""
@@ -132,3 +133,28 @@ def parameter_hash(store: ParameterStore) -> int:
     """Return PX4's param_hash_check(): CRC-32 without inversions over all names and values."""
     parameters = filter(None, map(store.by_index, range(len(store))))
     return crc32part(b"".join(p.name.encode("ascii") + _encoded(p.value) for p in parameters))
+
+
+# --- PREFLIGHT_STORAGE
+
+_LOAD, _SAVE, _RESET, _RESET_SENSORS, _FACTORY_RESET = range(5)
+
+
+def _store(command: Command, context: Context) -> Result | None:
+    """Parameter 1: what is done; PX4 does not acknowledge what it does not know."""
+    if context.port.state().status.arming is Arming.ARMED:
+        return Result.TEMPORARILY_REJECTED
+    parameters = context.port.parameters
+    asked = command.integer(1)
+    if asked in (_RESET, _FACTORY_RESET):
+        parameters.reset()
+    elif asked == _LOAD:
+        return Result.ACCEPTED if parameters.load() else Result.FAILED
+    elif asked == _SAVE:
+        return Result.ACCEPTED if parameters.save() else Result.FAILED
+    elif asked != _RESET_SENSORS:  # which have no calibration that could be reset
+        return None
+    return Result.ACCEPTED
+
+
+ACTIONS: dict[int, Action] = {dialect.MAV_CMD_PREFLIGHT_STORAGE: _store}

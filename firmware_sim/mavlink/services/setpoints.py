@@ -2,7 +2,7 @@
 
 Source: PX4 MavlinkReceiver::handle_message_set_position_target_local_ned, _global_int and
 _set_attitude_target, checked against a running PX4 1.16. PX4 says for every message that it is
-refused; here the same refusal is told once, until a setpoint is accepted again.
+refused. Here the same refusal is told once, until a setpoint is accepted again.
 """
 
 from __future__ import annotations
@@ -173,8 +173,12 @@ def _thrust(message: WireMessage) -> float:
 
 def _masked(values: tuple[float, float, float], ignore: int) -> Vector:
     """Return the commanded vector (3,); NaN where ignored or not a finite number."""
+    isfinite, nan = math.isfinite, math.nan
     return np.array(
-        [math.nan if ignore >> i & 1 else _finite(value) for i, value in enumerate(values)]
+        [
+            value if isfinite(value) and not ignore >> i & 1 else nan
+            for i, value in enumerate(values)
+        ]
     )
 
 
@@ -184,7 +188,7 @@ def _turned(velocity: Vector, quaternion: Vector) -> Vector:
 
 
 def _commands_something(*vectors: Vector) -> bool:
-    return any(bool(np.isfinite(vector).any()) for vector in vectors)
+    return any(map(math.isfinite, np.concatenate(vectors).tolist()))
 
 
 def _finite(value: float) -> float:
@@ -201,7 +205,5 @@ def _is_local(message: WireMessage) -> bool:
 
 def _reject(context: Context, why: Message) -> bool:
     context.port.refuse_setpoint(why.text, context.now_us)
-    if why.text not in context.refusals:
-        context.refusals.add(why.text)
-        context.announce(why)
+    context.announce_once(why)
     return False

@@ -5,11 +5,15 @@ Source: PX4 1.16, MavlinkReceiver::handle_message_serial_control, and what its s
 
 from __future__ import annotations
 
+import fnmatch
 import struct
+from collections.abc import Callable, Mapping, Sequence
 
+from airl_mav.core.constants import US_PER_S
+from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Mode
+from firmware_sim.autopilot.port import AutopilotPort
 from firmware_sim.mavlink.codec import WireMessage, dialect
 from firmware_sim.mavlink.services.context import Context
-from firmware_sim.mavlink.services.shell_commands import run
 
 PROMPT = "pxh> "
 
@@ -62,3 +66,132 @@ def send_pending(context: Context) -> None:
         context.link.send_payload(
             "SERIAL_CONTROL", _SERIAL_CONTROL.pack(no_rate, no_timeout, *_SHELL, len(part), part)
         )
+
+
+# --- commands: each prints what PX4's prints, where there is such a thing here
+
+Shown = Callable[[Sequence[str], AutopilotPort, int], str]
+"""Returns what a command prints: its further words, the autopilot, the time [µs]."""
+
+
+def run(words: Sequence[str], port: AutopilotPort, now_us: int) -> str:
+    """Return what a line prints, whole lines."""
+    if not words:
+        return ""
+    command = COMMANDS.get(words[0])
+    if command is None:
+        return f"Invalid command: {words[0]}\ntype 'help' for a list of commands\n"
+    return command(words[1:], port, now_us)
+
+
+def _help(_words: Sequence[str], _port: AutopilotPort, _now_us: int) -> str:
+    return "".join(f"  {name}\n" for name in sorted(COMMANDS))
+
+
+def _version(_words: Sequence[str], _port: AutopilotPort, _now_us: int) -> str:
+    return "HW arch: AIRL_SITL\nPX4 version: 1.16.0 (emulated by airl-mav)\n"
+
+
+def _uptime(_words: Sequence[str], _port: AutopilotPort, now_us: int) -> str:
+    return f"Uptime: {now_us / US_PER_S:.3f} s of simulated time\n"
+
+
+def _parameters(words: Sequence[str], port: AutopilotPort, _now_us: int) -> str:
+    """Param show [NAME, with * and ?]."""
+    if not words or words[0] != "show" or len(words) > 2:
+        return "usage: param show [NAME]\n"
+    pattern = words[1] if len(words) == 2 else "*"
+    lines = ["Symbols: x = used, + = saved, * = unsaved"]
+    store = port.parameters
+    for index in range(len(store)):
+        found = store.by_index(index)
+        if found is not None and fnmatch.fnmatchcase(found.name, pattern):
+            value = found.value
+            shown = f"{value}" if isinstance(value, int) else f"{value:.4f}"
+            lines.append(f"x   {found.name} [{index},{index}] : {shown}")
+    return "\n".join([*lines, "", f" {len(store)}/{len(store)} parameters used.", ""])
+
+
+def _commander(words: Sequence[str], port: AutopilotPort, _now_us: int) -> str:
+    if list(words) != ["status"]:
+        return "usage: commander status\n"
+    status = port.state().status
+    armed = "Armed" if status.arming is Arming.ARMED else "Disarmed"
+    said = (
+        armed,
+        f"navigation mode: {_title(status.mode)}",
+        f"user intended navigation mode: {_title(status.intended_mode)}",
+        f"in failsafe: {'yes' if status.failsafe else 'no'}",
+    )
+    return "".join(f"INFO  [commander] {line}\n" for line in said)
+
+
+def _title(mode: Mode) -> str:
+    return mode.name.replace("_", " ").title()
+
+
+def _local_position(state: AutopilotState) -> dict[str, float]:
+    estimate = state.estimate
+    names = ("x", "y", "z", "vx", "vy", "vz")
+    return dict(zip(names, (*estimate.position.tolist(), *estimate.velocity.tolist()), strict=True))
+
+
+def _attitude(state: AutopilotState) -> dict[str, float]:
+    return {f"q[{i}]": q for i, q in enumerate(state.estimate.quaternion.tolist())}
+
+
+def _battery(state: AutopilotState) -> dict[str, float]:
+    battery = state.battery
+    return {
+        "voltage_v": battery.voltage_v,
+        "current_a": battery.current_a,
+        "discharged_mah": battery.consumed_mah,
+        "remaining": battery.remaining,
+    }
+
+
+def _vehicle_status(state: AutopilotState) -> dict[str, float]:
+    status = state.status
+    return {
+        "armed_time": state.armed_us,
+        "takeoff_time": state.takeoff_us,
+        "arming_state": 2 if status.arming is Arming.ARMED else 1,
+        "failsafe": status.failsafe,
+        "pre_flight_checks_pass": status.arming is not Arming.BOOT,
+    }
+
+
+_TOPICS: Mapping[str, Callable[[AutopilotState], Mapping[str, float]]] = {
+    "battery_status": _battery,
+    "vehicle_attitude": _attitude,
+    "vehicle_local_position": _local_position,
+    "vehicle_status": _vehicle_status,
+}
+
+
+def _listener(words: Sequence[str], port: AutopilotPort, now_us: int) -> str:
+    """Listener TOPIC: its newest message, once."""
+    topic = words[0] if words else ""
+    fields = _TOPICS.get(topic)
+    if fields is None:
+        topics = " ".join(sorted(_TOPICS))
+        return f"Topic {topic} did not match any known topics\nthere are: {topics}\n"
+    state = port.state()
+    age_s = (now_us - state.time_us) / US_PER_S
+    lines = [f"    timestamp: {state.time_us} ({age_s:.6f} seconds ago)"]
+    lines += [f"    {name}: {_shown(value)}" for name, value in fields(state).items()]
+    return "\n".join(["", f"TOPIC: {topic}", f" {topic}", *lines, "", ""])
+
+
+def _shown(value: float) -> str:
+    return f"{value:.4f}" if isinstance(value, float) else f"{value}"
+
+
+COMMANDS: Mapping[str, Shown] = {
+    "commander": _commander,
+    "help": _help,
+    "listener": _listener,
+    "param": _parameters,
+    "uptime": _uptime,
+    "ver": _version,
+}

@@ -1,6 +1,6 @@
 """Commands that do nothing here and are answered as a running PX4 1.16 SITL answers them.
 
-Some that PX4 accepts need no more than that (there is nothing to switch); some it hands to a part
+Some that PX4 accepts need no more than that (there is nothing to switch). Some it hands to a part
 of the vehicle that is not there, and so nobody acknowledges them.
 """
 
@@ -9,8 +9,7 @@ from __future__ import annotations
 from firmware_sim.autopilot.autopilot_state import Arming, Message, Result, Severity
 from firmware_sim.autopilot.events import command_events as events
 from firmware_sim.mavlink.codec import dialect
-from firmware_sim.mavlink.services.command import Action, Command
-from firmware_sim.mavlink.services.context import Context
+from firmware_sim.mavlink.services.context import Action, Command, Context
 
 ACCEPTED = (
     dialect.MAV_CMD_DO_SET_ACTUATOR,
@@ -47,12 +46,9 @@ NOT_ACKNOWLEDGED = (
 )
 
 
-def _accept(_command: Command, _context: Context) -> Result:
-    return Result.ACCEPTED
-
-
-def _ignore(_command: Command, _context: Context) -> None:
-    return None
+def _answer(result: Result | None) -> Action:
+    """Return the action that does nothing and answers so."""
+    return lambda _command, _context: result
 
 
 def _actuator_test(_command: Command, context: Context) -> Result | None:
@@ -61,20 +57,16 @@ def _actuator_test(_command: Command, context: Context) -> Result | None:
     return Result.DENIED if armed else None
 
 
-def _reject_for_now(_command: Command, _context: Context) -> Result:
-    return Result.TEMPORARILY_REJECTED
-
-
 def _high_latency(_command: Command, context: Context) -> Result:
     context.announce(Message.of(Severity.CRITICAL, events.NO_HIGH_LATENCY))
     return Result.FAILED
 
 
 ACTIONS: dict[int, Action] = {
-    **dict.fromkeys(ACCEPTED, _accept),
-    **dict.fromkeys(NOT_ACKNOWLEDGED, _ignore),
+    **dict.fromkeys(ACCEPTED, _answer(Result.ACCEPTED)),
+    **dict.fromkeys(NOT_ACKNOWLEDGED, _answer(None)),
     dialect.MAV_CMD_ACTUATOR_TEST: _actuator_test,
     dialect.MAV_CMD_CONTROL_HIGH_LATENCY: _high_latency,
     # The estimator takes a place from outside only while it has none of its own.
-    dialect.MAV_CMD_EXTERNAL_POSITION_ESTIMATE: _reject_for_now,
+    dialect.MAV_CMD_EXTERNAL_POSITION_ESTIMATE: _answer(Result.TEMPORARILY_REJECTED),
 }

@@ -1,14 +1,12 @@
 """HIL_STATE_QUATERNION: the simulator's true state, for those who compare with it.
 
-PX4 SITL has it from its simulator and sends it to whoever asks for it, to nobody unasked; so does
-the built-in firmware, and real firmware is sent it by the same function. Nothing that flies reads
-it. Source: PX4 1.16, streams/HIL_STATE_QUATERNION.hpp.
+Sent on request only, as PX4 SITL sends the state of its simulator. Real firmware gets it by the
+same function. No flight code reads it. Source: PX4 1.16, streams/HIL_STATE_QUATERNION.hpp.
 """
 
 from __future__ import annotations
 
-from airl_mav.core.frames import local_to_geodetic
-from airl_mav.core.location import HOME
+from airl_mav.core.frames import HOME, local_to_geodetic
 from firmware_sim.interfaces import Truth
 from firmware_sim.mavlink.codec import Values
 from firmware_sim.mavlink.streams import units

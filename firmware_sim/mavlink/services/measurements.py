@@ -1,19 +1,23 @@
-"""ODOMETRY and VISION_POSITION_ESTIMATE: poses that somebody else estimates, for the estimator.
+"""Measurements from clients: poses, distances, optical flow, obstacles and landing targets.
 
-Source: PX4 1.16, MavlinkReceiver::handle_message_odometry and handle_message_vision_position_
-estimate, and EKF2::UpdateExtVisionSample, which drops what is not a rotation. Motion capture, as
-ODOMETRY of that type or ATT_POS_MOCAP, has no effect: PX4 publishes it apart, and EKF2 does not
-take it. When a sample was measured is told by EKF2_EV_DELAY alone: clocks are not compared.
+Source: PX4 1.16, the handlers of these messages in MavlinkReceiver, and
+EKF2::UpdateExtVisionSample, which drops what is not a rotation. The senders' times are not used:
+EKF2_EV_DELAY alone gives the age of a pose. Motion capture, as ODOMETRY of that type or
+ATT_POS_MOCAP, has no effect: PX4 publishes it apart, and EKF2 does not take it.
 """
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
+from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Vector, quat_from_euler
 from firmware_sim.autopilot.autopilot_state import Message, Severity
 from firmware_sim.autopilot.events import command_events as events
-from firmware_sim.interfaces import Odometry, PoseFrame, VelocityFrame
+from firmware_sim.autopilot.requests import LandingTarget, Obstacles
+from firmware_sim.interfaces import DistanceReading, FlowReading, Odometry, PoseFrame, VelocityFrame
 from firmware_sim.mavlink.codec import WireMessage, dialect
 from firmware_sim.mavlink.services.context import Context
 from firmware_sim.mavlink.streams.units import DIAGONAL
@@ -47,16 +51,14 @@ _UNIT_TOLERANCE = 1e-5
 
 
 def handle_odometry(message: WireMessage, context: Context) -> bool:
-    """Hand over what is valid of it; an estimator's type that PX4 does not take is told, once."""
+    """ODOMETRY: hand over its valid parts; report once an estimator type that PX4 rejects."""
     kind = message.estimator_type
     if kind == dialect.MAV_ESTIMATOR_TYPE_MOCAP:
         return False
     if kind not in _FUSED:
         text = f"ODOMETRY: estimator_type {kind} unsupported"
-        if text not in context.refusals:
-            context.refusals.add(text)
-            event = events.ODOMETRY_ESTIMATOR
-            context.announce(Message.of(Severity.CRITICAL, event, kind, text=text))
+        event = events.ODOMETRY_ESTIMATOR
+        context.announce_once(Message.of(Severity.CRITICAL, event, kind, text=text))
         return False
     naive = kind == dialect.MAV_ESTIMATOR_TYPE_NAIVE
     place = _finite(message.x, message.y, message.z)
@@ -82,7 +84,7 @@ def handle_odometry(message: WireMessage, context: Context) -> bool:
 
 
 def handle_vision_position(message: WireMessage, context: Context) -> bool:
-    """Hand over a pose in local NED."""
+    """VISION_POSITION_ESTIMATE: a pose in local NED."""
     told = _diagonal(message.covariance)
     angles = _finite(message.roll, message.pitch, message.yaw)
     return _see(
@@ -119,11 +121,8 @@ def _in_our_axes(
 ) -> tuple[Vector | None, Vector]:
     """Return a vector and variances (6,); None and NaN where they are not known.
 
-    Args:
-        frame: Its frame, and whether that has other axes than ours; None = not one of ours.
-        vector: As it was told (3,).
-        covariance: As it was told.
-        naive: Whether its sender cannot tell one.
+    `frame` says whether its axes are others than ours; None = an unknown frame. A `naive` sender
+    has no covariance.
     """
     if frame is None:
         return None, _NOT_TOLD
@@ -154,3 +153,93 @@ def _rotation(quaternion: Vector) -> Vector | None:
         return None
     rotation: Vector = quaternion / length
     return rotation
+
+
+# --- distances, optical flow, obstacles, landing targets
+
+
+def handle_distance(message: WireMessage, context: Context) -> bool:
+    """DISTANCE_SENSOR: the estimator uses it if the sensor looks down."""
+    context.port.measure_distance(
+        DistanceReading(
+            message.current_distance * 1e-2,
+            message.min_distance * 1e-2,
+            message.max_distance * 1e-2,
+            message.covariance * 1e-4,
+            quality_of(message.signal_quality),
+            message.orientation,
+            message.type,
+        )
+    )
+    return True
+
+
+def quality_of(signal_quality: int) -> int:
+    """Return a quality [%] of the field's 1 (invalid) to 100, 0 = not told; -1 = not told.
+
+    More than the field's greatest is taken for that; PX4's byte would overflow.
+    """
+    return -1 if signal_quality == 0 else 100 * (min(signal_quality, 100) - 1) // 99
+
+
+def handle_optical_flow(message: WireMessage, context: Context) -> bool:
+    """OPTICAL_FLOW_RAD; distance and temperature are not used."""
+    turned = (message.integrated_xgyro, message.integrated_ygyro, message.integrated_zgyro)
+    context.port.look_down(
+        FlowReading(
+            np.array([message.integrated_x, message.integrated_y]),
+            message.integration_time_us / US_PER_S,
+            message.quality,
+            np.array(turned),
+        )
+    )
+    return True
+
+
+_IN_WORLD = (dialect.MAV_FRAME_GLOBAL, dialect.MAV_FRAME_LOCAL_NED)
+_IN_BODY = dialect.MAV_FRAME_BODY_FRD
+
+
+def handle_obstacle_distance(message: WireMessage, context: Context) -> bool:
+    """OBSTACLE_DISTANCE; like PX4, report an unknown frame only if CP_DIST is set."""
+    frame = message.frame
+    if frame not in _IN_WORLD and frame != _IN_BODY:
+        if context.port.parameters.value("CP_DIST") > 0.0:
+            text = f"Obstacle message received in unsupported frame {frame}"
+            event = events.OBSTACLE_FRAME
+            context.announce_once(Message.of(Severity.CRITICAL, event, frame, text=text))
+        return False
+    increment = message.increment_f if message.increment_f > 0.0 else float(message.increment)
+    if not (0.0 < increment <= 360.0 and math.isfinite(message.angle_offset)):
+        return False
+    context.port.see_obstacles(
+        Obstacles(
+            tuple(message.distances),
+            increment,
+            message.angle_offset,
+            message.min_distance,
+            message.max_distance,
+            in_world=frame in _IN_WORLD,
+            time_us=context.now_us,
+        )
+    )
+    return True
+
+
+def handle_landing_target(message: WireMessage, context: Context) -> bool:
+    """LANDING_TARGET: like PX4, accept positions in local NED alone.
+
+    Bearings of a target need a module that PX4's SITL does not start, and have no effect.
+    """
+    if not message.position_valid:
+        return False
+    if message.frame != dialect.MAV_FRAME_LOCAL_NED:
+        text = f"Landing target: coordinate frame {message.frame} unsupported"
+        event = events.LANDING_TARGET_FRAME
+        context.announce_once(Message.of(Severity.CRITICAL, event, message.frame, text=text))
+        return False
+    position = message.x, message.y, message.z
+    if not all(map(math.isfinite, position)):
+        return False
+    context.port.landing_target(LandingTarget(position, context.now_us))
+    return True

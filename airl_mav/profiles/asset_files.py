@@ -1,4 +1,4 @@
-"""Files that an arena's profile names, with their digests: the meshes that cameras see."""
+"""Files that an arena's profile names, with their digests: meshes and images of textures."""
 
 from __future__ import annotations
 
@@ -83,3 +83,16 @@ def read_checked(named: CheckedFile) -> bytes:
             f"{named.sha256[:16]}..."
         )
     return data
+
+
+MOST_IMAGES = 16
+"""Of one arena."""
+
+
+class ImageFile(CheckedFile):
+    """A picture that repeats on a surface."""
+
+    file: str = Field(
+        min_length=1,
+        description="a PNG or JPEG, as wide as it is high; a path from the profile's folder",
+    )
