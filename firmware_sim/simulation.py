@@ -38,8 +38,11 @@ from firmware_sim.plant.plant import Plant
 from firmware_sim.recording import FlightRecorder, fault_arrays
 from firmware_sim.simulation_snapshot import SimulationSnapshot
 
-MOST_TICKS = 25
-"""Ticks that are flown at a time, at most: streams at 10 Hz and below are sent in between."""
+STRETCH_US = 100_000
+"""A stretch of ticks ends at multiples of this simulated time, if not before [µs]: streams at 10 Hz
+and below are sent in between."""
+
+MOST_TICKS = STRETCH_US // TICK_US
 
 
 _ENDS = (COLLIDED, ALIGN)
@@ -239,7 +242,8 @@ class Simulation:
             autopilot.take(self._sample)
             self._sample = None
         plant, done, time_us = self.plant, 0, self.time_us
-        most = max(1, math.ceil(min((until_us - time_us) / TICK_US, MOST_TICKS)))
+        until_us = min(until_us, time_us - time_us % STRETCH_US + STRETCH_US)
+        most = max(1, math.ceil((until_us - time_us) / TICK_US))
         arrives_us = math.inf if arrivals is None else arrivals.next_us
         while done < most:
             if done and arrivals is not None and arrives_us <= time_us:

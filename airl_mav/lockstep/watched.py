@@ -41,8 +41,8 @@ class Watched:
         self._simulation.frame(frame)
 
     def tick(self, simulation: Simulation, collision: str | None) -> None:
-        """Show the state after a tick, and wait as the watchers ask for."""
-        self._simulation.tick(simulation, collision)
+        """Show the newest ticks, and wait as the watchers ask for."""
+        self._simulation.tick(simulation, collision, self._pace.tick)
         self._pace.tick(simulation.time_us)
 
     def decided(self, decision: Decided) -> None:

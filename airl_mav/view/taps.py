@@ -20,6 +20,7 @@ from airl_mav.view.ends import ViewEnds
 from airl_mav.view.feed import Asked, Feed
 from companion.pilot import Decided as Decision
 from firmware_sim.autopilot.commander import Phase
+from firmware_sim.engine.kinematics import POSITION, QUATERNION, VELOCITY
 from firmware_sim.simulation import Simulation
 
 
@@ -121,27 +122,39 @@ class SimulationTap:
             )
         )
 
-    def tick(self, simulation: Simulation, collision: str | None) -> None:
-        """A tick was flown; `collision` is what has been hit so far."""
-        due = simulation.time_us // VEHICLE_EVERY_US
-        if due == self._vehicle_due:
-            return
-        self._vehicle_due = due
-        truth, flight = simulation.truth, simulation.autopilot.flight
-        plant = simulation.plant
-        self._feed.send(
-            messages.Vehicle(
-                time_us=truth.time_us,
-                position=tuple(truth.position.tolist()),
-                velocity=tuple(truth.velocity.tolist()),
-                quaternion=tuple(truth.quaternion.tolist()),
-                rotors=plant.rotor_speeds,
-                battery=truth.battery_remaining,
-                mode=flight.mode.name.lower().replace("_", " "),
-                armed=flight.phase >= Phase.GROUND,
-                collision=collision,
+    def tick(
+        self,
+        simulation: Simulation,
+        collision: str | None,
+        pace: Callable[[int], None] = lambda _time_us: None,
+    ) -> None:
+        """Show the newest ticks.
+
+        Args:
+            simulation: Has flown them.
+            collision: What has been hit so far.
+            pace: Called after each state that was sent, with its time [µs].
+        """
+        flight, rotors = simulation.autopilot.flight, simulation.plant.rotor_speeds
+        for time_us, motion, _, charge in simulation.truths.tolist():
+            due = time_us // VEHICLE_EVERY_US
+            if due == self._vehicle_due:
+                continue
+            self._vehicle_due = due
+            self._feed.send(
+                messages.Vehicle(
+                    time_us=time_us,
+                    position=tuple(motion[POSITION].tolist()),
+                    velocity=tuple(motion[VELOCITY].tolist()),
+                    quaternion=tuple(motion[QUATERNION].tolist()),
+                    rotors=rotors,
+                    battery=charge,
+                    mode=flight.mode.name.lower().replace("_", " "),
+                    armed=flight.phase >= Phase.GROUND,
+                    collision=collision,
+                )
             )
-        )
+            pace(time_us)
 
     def frame(self, frame: Frame) -> None:
         """The camera has taken a frame."""

@@ -44,6 +44,9 @@ class LinkConfig:
     """Whether answers to requests count their own sequence numbers, so that the bytes of the
     telemetry do not depend on when a client sent a request. Only for a link whose other end does
     not take a jump in the sequence for lost messages."""
+    slow_every_us: int = 0
+    """Streams that are not packed in compiled code are sent at multiples of this simulated time, so
+    that they do not depend on how many ticks are flown at a time [µs]; 0 = at any tick."""
 
 
 def onboard_link(endpoint: SharedEndpoint, *, separate_replies: bool = False) -> LinkConfig:
@@ -128,7 +131,10 @@ class Link:
         self.builders = builders
         names = [*config.rates_hz, *(name for name in builders if name not in config.rates_hz)]
         self.scheduler = StreamScheduler(
-            names, {name: interval_us(hz) for name, hz in config.rates_hz.items()}, NUMBERS
+            names,
+            {name: interval_us(hz) for name, hz in config.rates_hz.items()},
+            NUMBERS,
+            config.slow_every_us,
         )
         self._packer = Packer()
         self.tap: Callable[[Sequence[bytes]], None] | None = None

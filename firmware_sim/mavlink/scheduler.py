@@ -33,6 +33,7 @@ class StreamScheduler:
         names: Sequence[str],
         default_us: Mapping[str, int],
         fast: Mapping[str, int] = _NONE,
+        every_us: int = 0,
     ) -> None:
         """Start at simulated time 0 with the default intervals [µs].
 
@@ -40,7 +41,9 @@ class StreamScheduler:
             names: All streams, in their order within a tick.
             default_us: Their intervals; one without a default is off.
             fast: Places of the fast streams in the table of compiled code.
+            every_us: The others are due at multiples of this time only [µs]; 0 = at any time.
         """
+        self._every_us = every_us or 1
         self._names = tuple(names)
         self._index = {name: i for i, name in enumerate(self._names)}
         self._default = [default_us.get(name, OFF) for name in self._names]
@@ -96,10 +99,14 @@ class StreamScheduler:
         if self._rebase_pending:
             self._rebase(now_us)
 
+    def is_time(self, now_us: int) -> bool:
+        """Return whether streams besides the fast ones may be sent at `now_us` [µs]."""
+        return now_us % self._every_us == 0
+
     def due(self, now_us: int) -> list[str]:
         """Return the streams to send at `now_us` [µs] and plan their next time."""
         self.begin(now_us)
-        if now_us < self._next_us:
+        if now_us < self._next_us or now_us % self._every_us:
             return []
         plan, names = self._slow_due_us, []
         for due_us, i in sorted([(due_us, i) for i, due_us in plan.items() if due_us <= now_us]):
@@ -122,6 +129,9 @@ class StreamScheduler:
 
     def _rebase(self, now_us: int) -> None:
         self._rebase_pending = False
+        if self._every_us > 1:
+            # The beginning of the period, however many of its ticks have been flown.
+            now_us = max(0, now_us - 1) // self._every_us * self._every_us
         for i, interval_us in enumerate(self.intervals_us.tolist()):
             self._plan(i, now_us if interval_us == OFF else now_us + i * TICK_US % interval_us)
         self.wake_us = self._next_us = self.fast_us = now_us

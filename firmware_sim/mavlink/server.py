@@ -235,7 +235,8 @@ class MavlinkServer:
                 _stream_news(client, texts, now_us)
             if len(names) > share:
                 names, client.late = names[:share], names[share:]
-            if origin is not None and origin != client.announced_origin:
+            moved = origin is not None and origin != client.announced_origin
+            if moved and link.scheduler.is_time(now_us):
                 client.announced_origin = origin
                 names = ["GPS_GLOBAL_ORIGIN", *names]
             link.stream_due(names, state, payloads)

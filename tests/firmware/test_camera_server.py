@@ -94,10 +94,7 @@ def test_images_are_drawn_when_they_are_read(monkeypatch: pytest.MonkeyPatch) ->
         return expose(*seen)
 
     monkeypatch.setattr(cams[1]._eyes[""], "_expose", drawing)
-    place, frames = north.copy(), []
-    for at_us in times_us:
-        place[:] = north + at_us * 1e-6
-        frames.append(cams[1].capture(at_us, place, turned))
+    frames = [cams[1].capture(at_us, north + at_us * 1e-6, turned) for at_us in times_us]
     assert not drawn
     assert len({image.tobytes() for image, *_ in at_once}) == len(at_once)
     for (image, *stamps), late in reversed(list(zip(at_once, frames, strict=True))):

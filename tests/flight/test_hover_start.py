@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import binomtest
 
-from airl_mav.core.constants import TICK_US, US_PER_S
+from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import FieldError
 from airl_mav.flight.judge import Outcome
 from airl_mav.flight.record import EpisodeRecord
@@ -21,6 +21,7 @@ from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 from airl_mav.scenario.resolved import ResolvedScenario
 from companion.mission import MissionResult
+from firmware_sim.simulation import STRETCH_US
 from tests.support.lockstep_kit import SEED, demo_scenario, fly_as_companion
 
 AHEAD = 22
@@ -41,7 +42,7 @@ def test_a_flight_begins_in_the_air_and_ends_at_the_verdict() -> None:
     assert record.outcome is Outcome.SUCCESS
     assert record.notes == ()
     assert flight.trajectory.position[0, 2] == pytest.approx(-2.5, abs=0.4)
-    assert flight.trajectory.time_us[-1] - record.ended_us <= TICK_US
+    assert flight.trajectory.time_us[-1] - record.ended_us <= STRETCH_US
     assert record.navigation_us is not None
     began_s = (record.navigation_us - record.started_us) / US_PER_S
     assert record.tours_s == pytest.approx(began_s, abs=0.05)
