@@ -39,8 +39,8 @@ from firmware_sim.recording import FlightRecorder, fault_arrays
 from firmware_sim.simulation_snapshot import SimulationSnapshot
 
 STRETCH_US = 100_000
-"""A stretch of ticks ends at multiples of this simulated time, if not before [µs]: streams at 10 Hz
-and below are sent in between."""
+"""A stretch of ticks ends at multiples of this simulated time after the first tick, if not before
+[µs]: streams at 10 Hz and below are sent in between."""
 
 MOST_TICKS = STRETCH_US // TICK_US
 
@@ -242,7 +242,7 @@ class Simulation:
             autopilot.take(self._sample)
             self._sample = None
         plant, done, time_us = self.plant, 0, self.time_us
-        until_us = min(until_us, time_us - time_us % STRETCH_US + STRETCH_US)
+        until_us = min(until_us, time_us + STRETCH_US - (time_us - TICK_US) % STRETCH_US)
         most = max(1, math.ceil((until_us - time_us) / TICK_US))
         arrives_us = math.inf if arrivals is None else arrivals.next_us
         while done < most:

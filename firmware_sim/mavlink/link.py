@@ -45,8 +45,8 @@ class LinkConfig:
     telemetry do not depend on when a client sent a request. Only for a link whose other end does
     not take a jump in the sequence for lost messages."""
     slow_every_us: int = 0
-    """Streams that are not packed in compiled code are sent at multiples of this simulated time, so
-    that they do not depend on how many ticks are flown at a time [µs]; 0 = at any tick."""
+    """Streams that are not packed in compiled code are sent at multiples of this simulated time
+    after the first tick [µs]: they do not depend on how many are flown at a time. 0 = at any."""
 
 
 def onboard_link(endpoint: SharedEndpoint, *, separate_replies: bool = False) -> LinkConfig:

@@ -41,7 +41,8 @@ class StreamScheduler:
             names: All streams, in their order within a tick.
             default_us: Their intervals; one without a default is off.
             fast: Places of the fast streams in the table of compiled code.
-            every_us: The others are due at multiples of this time only [µs]; 0 = at any time.
+            every_us: The others are due at multiples of this time after the first tick only [µs];
+                0 = at any time.
         """
         self._every_us = every_us or 1
         self._names = tuple(names)
@@ -101,12 +102,12 @@ class StreamScheduler:
 
     def is_time(self, now_us: int) -> bool:
         """Return whether streams besides the fast ones may be sent at `now_us` [µs]."""
-        return now_us % self._every_us == 0
+        return (now_us - TICK_US) % self._every_us == 0
 
     def due(self, now_us: int) -> list[str]:
         """Return the streams to send at `now_us` [µs] and plan their next time."""
         self.begin(now_us)
-        if now_us < self._next_us or now_us % self._every_us:
+        if now_us < self._next_us or not self.is_time(now_us):
             return []
         plan, names = self._slow_due_us, []
         for due_us, i in sorted([(due_us, i) for i, due_us in plan.items() if due_us <= now_us]):
@@ -131,7 +132,7 @@ class StreamScheduler:
         self._rebase_pending = False
         if self._every_us > 1:
             # The beginning of the period, however many of its ticks have been flown.
-            now_us = max(0, now_us - 1) // self._every_us * self._every_us
+            now_us = TICK_US + (now_us - TICK_US - 1) // self._every_us * self._every_us
         for i, interval_us in enumerate(self.intervals_us.tolist()):
             self._plan(i, now_us if interval_us == OFF else now_us + i * TICK_US % interval_us)
         self.wake_us = self._next_us = self.fast_us = now_us
