@@ -156,6 +156,8 @@ def hover(
     autopilot.takeoff(2.5)
     for _ in range(round(8.0 / TICK_S)):
         simulation.tick()
+    while (simulation.time_us - TICK_US) % SETPOINT_US:
+        simulation.tick()  # setpoints come where stretches end
     free = np.full(3, math.nan)
     setpoint = Setpoint(free, np.array([1.0, 0.0, 0.0]), math.nan, 0.2)
     autopilot.offer_setpoint(setpoint, simulation.time_us)

@@ -41,8 +41,7 @@ class StreamScheduler:
             names: All streams, in their order within a tick.
             default_us: Their intervals; one without a default is off.
             fast: Places of the fast streams in the table of compiled code.
-            every_us: The others are due at multiples of this time after the first tick only [µs];
-                0 = at any time.
+            every_us: The others are due at multiples of this time [µs] after the first tick.
         """
         self._every_us = every_us or 1
         self._names = tuple(names)
