@@ -41,7 +41,7 @@ class StreamScheduler:
             names: All streams, in their order within a tick.
             default_us: Their intervals; one without a default is off.
             fast: Places of the fast streams in the table of compiled code.
-            every_us: The others are due at multiples of this time [µs] after the first tick.
+            every_us: Grid of the others, from the first tick on [µs]; 0 = any tick.
         """
         self._every_us = every_us or 1
         self._names = tuple(names)
@@ -100,13 +100,14 @@ class StreamScheduler:
             self._rebase(now_us)
 
     def is_time(self, now_us: int) -> bool:
-        """Return whether streams besides the fast ones may be sent at `now_us` [µs]."""
+        """Return whether slow streams may be sent at `now_us` [µs]."""
         return (now_us - TICK_US) % self._every_us == 0
 
     def due(self, now_us: int) -> list[str]:
         """Return the streams to send at `now_us` [µs] and plan their next time."""
+        begins = self._rebase_pending  # the first heartbeat does not wait
         self.begin(now_us)
-        if now_us < self._next_us or not self.is_time(now_us):
+        if now_us < self._next_us or not (begins or self.is_time(now_us)):
             return []
         plan, names = self._slow_due_us, []
         for due_us, i in sorted([(due_us, i) for i, due_us in plan.items() if due_us <= now_us]):
@@ -130,7 +131,6 @@ class StreamScheduler:
     def _rebase(self, now_us: int) -> None:
         self._rebase_pending = False
         if self._every_us > 1:
-            # The beginning of the period, however many of its ticks have been flown.
             now_us = TICK_US + (now_us - TICK_US - 1) // self._every_us * self._every_us
         for i, interval_us in enumerate(self.intervals_us.tolist()):
             self._plan(i, now_us if interval_us == OFF else now_us + i * TICK_US % interval_us)
