@@ -241,21 +241,21 @@ class Simulation:
         if self._sample is not None:
             autopilot.take(self._sample)
             self._sample = None
-        plant, done, time_us = self.plant, 0, self.time_us
-        until_us = min(until_us, time_us + STRETCH_US - (time_us - TICK_US) % STRETCH_US)
-        most = max(1, math.ceil((until_us - time_us) / TICK_US))
+        plant, done = self.plant, 0
+        until_us = min(until_us, self.time_us + STRETCH_US - (self.time_us - TICK_US) % STRETCH_US)
+        most = max(1, math.ceil((until_us - self.time_us) / TICK_US))
         arrives_us = math.inf if arrivals is None else arrivals.next_us
         while done < most:
-            if done and arrivals is not None and arrives_us <= time_us:
-                arrivals.arrive(time_us)
+            if done and arrivals is not None and arrives_us <= self.time_us:
+                arrivals.arrive(self.time_us)
                 arrives_us = arrivals.next_us
                 if self.recorder is not None:
                     self.recorder.before_controls(done)
             due_us = min(autopilot.decide_if_due(), arrives_us)
-            ticks = max(1, math.ceil(min((due_us - time_us) / TICK_US, most - done)))
+            ticks = max(1, math.ceil(min((due_us - self.time_us) / TICK_US, most - done)))
             flown, event = self._glide(autopilot, done, done + ticks)
             done += flown
-            time_us += flown * TICK_US
+            self.time_us += flown * TICK_US
             changed = autopilot.flown(plant.newest)
             # After what Python fuses, other aids may be in use.
             if changed or event in _ENDS or (event == FUSE and not autopilot.compiled):
