@@ -563,8 +563,7 @@ class BuiltinAutopilot:
         status = self._commander.status
         if self._snapshot is not None and self._snapshot.status is status:
             return self._snapshot
-        sample = self.sample
-        if sample is None:
+        if self._taken_us < 0:
             raise RuntimeError("no tick yet: the autopilot has no state")
-        self._snapshot = Snapshot(self._parts, sample, self._demand, self._motors)
+        self._snapshot = Snapshot(self._parts, self._taken_us, self._demand)
         return self._snapshot

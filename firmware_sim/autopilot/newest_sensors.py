@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from airl_mav.control.mixer import Motors
 from airl_mav.core.frames import HOME, Vector, local_to_geodetic
 from firmware_sim.engine.record import GPS_ROW, SEEN, Record
 from firmware_sim.interfaces import GpsFix, SensorSample
@@ -33,6 +34,12 @@ class NewestSensors:
                 position=local_to_geodetic(place, HOME), velocity_ned=velocity.copy()
             )
         return self._fix
+
+    @property
+    def esc_outputs(self) -> Motors | None:
+        """Reported motor outputs, 0..1; None = the newest sample has none."""
+        # A compiled tick measures none.
+        return None if self._read or self._sample is None else self._sample.esc_outputs
 
     @property
     def mag(self) -> Vector:

@@ -67,28 +67,24 @@ class Snapshot:
 
     load = 0.0
 
-    __slots__ = ("_controlled", "_demand", "_health", "_parts", "_sample", "motors", "status")
+    __slots__ = ("_controlled", "_demand", "_health", "_parts", "status", "time_us")
 
-    def __init__(
-        self, parts: Parts, sample: SensorSample, demand: AnyDemand | None, motors: Motors
-    ) -> None:
+    def __init__(self, parts: Parts, time_us: int, demand: AnyDemand | None) -> None:
         """Take it after a tick.
 
         Args:
             parts: Of the autopilot.
-            sample: The tick's sensors.
+            time_us: Of the tick [µs].
             demand: What is flown; None = the motors are stopped.
-            motors: Their commands, 0..1.
         """
-        self._parts, self._sample, self._demand = parts, sample, demand
-        self.motors = motors
+        self._parts, self.time_us, self._demand = parts, time_us, demand
         self.status: CommanderStatus = parts.commander.status
         self._controlled: ControlSetpoints | None = None
         self._health: Health | None = None
 
     @property
-    def time_us(self) -> int:
-        return self._sample.time_us
+    def motors(self) -> Motors:
+        return self._parts.controller.motors
 
     @property
     def estimate(self) -> Estimate:
@@ -173,7 +169,7 @@ class Snapshot:
     @property
     def health(self) -> Health:
         if self._health is None:
-            self._health = self._parts.supervisor.health(self._sample.time_us)
+            self._health = self._parts.supervisor.health(self.time_us)
         return self._health
 
     @property
@@ -194,7 +190,7 @@ class Snapshot:
 
     @property
     def esc_outputs(self) -> tuple[float, float, float, float] | None:
-        return self._sample.esc_outputs
+        return self._parts.newest.esc_outputs
 
     @property
     def odometry(self) -> Odometry | None:
@@ -228,6 +224,12 @@ class Snapshot:
     def clearance(self) -> Clearance | None:
         finder = self._parts.estimator.range
         return None if finder is None else finder.clearance()
+
+    @property
+    def _sample(self) -> SensorSample:
+        sample = self._parts.newest.sample
+        assert sample is not None  # noqa: S101 (a snapshot is taken after a tick)
+        return sample
 
     @property
     def _setpoints(self) -> ControlSetpoints:

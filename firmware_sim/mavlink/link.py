@@ -24,7 +24,7 @@ from firmware_sim.mavlink.endpoint import Endpoint, SharedEndpoint
 from firmware_sim.mavlink.rates import GCS_HZ, GIMBAL_HZ, ONBOARD_HZ, PAYLOAD_HZ, interval_us
 from firmware_sim.mavlink.scheduler import StreamScheduler
 from firmware_sim.mavlink.streams import Builder
-from firmware_sim.mavlink.telemetry import NUMBERS, Ints, Packer
+from firmware_sim.mavlink.telemetry import NUMBERS, Packer
 from firmware_sim.mavlink.telemetry import payload as fast_payload
 
 Payloads = dict[Builder, "bytes | None"]
@@ -272,23 +272,24 @@ class Link:
             elif payload is not None:
                 self._unsendable += 1
 
-    def stream_fast(self, flown: Record, times_us: Ints, context: Vector, most: int) -> None:
+    def stream_fast(self, flown: Record, after_us: int, context: Vector, most: int) -> None:
         """Add the fast streams of n ticks to the telemetry.
 
         Args:
             flown: (n,) logs of the ticks.
-            times_us: (n,) when each ended [µs].
+            after_us: Time from the log of a tick to its end [µs].
             context: As `telemetry.context_of`.
             most: Frames a tick, at most.
         """
         plan, encoder = self.scheduler, self._stream_encoder
-        frames = self._packer.pack(
-            *(flown, times_us, context, plan.numbers, plan.due_us, plan.intervals_us),
+        frames, next_us = self._packer.pack(
+            *(flown, after_us, context, plan.numbers, plan.due_us, plan.intervals_us),
             *(encoder.system_id, encoder.sequence, most),
         )
-        encoder.skip(len(frames))
-        plan.packed()
-        self.pending += frames
+        plan.packed(next_us)
+        if frames:
+            encoder.skip(len(frames))
+            self.pending += frames
 
     def flush(self) -> None:
         """Send the telemetry that has been added."""

@@ -55,7 +55,6 @@ class StreamScheduler:
         """(s,) next times of the fast streams [µs]."""
         self._slow_due_us: dict[int, int] = {}
         """Next times of the other streams that are sent [µs], by their place."""
-        self._fast = np.flatnonzero(self.numbers >= 0)
         self.fast_us = 0
         """When the next of the fast streams is due, or earlier [µs]."""
         self._next_us = 0
@@ -89,10 +88,10 @@ class StreamScheduler:
         self._rebase_pending = True
         self.wake_us = 0
 
-    def packed(self) -> None:
-        """Take note that fast streams were packed, and planned anew."""
-        self.fast_us = int(np.minimum.reduce(self.due_us[self._fast], initial=_NEVER))
-        self.wake_us = min(self.fast_us, self._next_us)
+    def packed(self, next_us: int) -> None:
+        """Take note that fast streams were packed; the next of them is due at `next_us` [µs]."""
+        self.fast_us = next_us
+        self.wake_us = min(next_us, self._next_us)
 
     def begin(self, now_us: int) -> None:
         """Take simulated `now_us` [µs] for the time base, where that is asked for."""

@@ -32,7 +32,7 @@ from firmware_sim.mavlink.services.context import Context
 from firmware_sim.mavlink.services.transfers import RunningCalibration
 from firmware_sim.mavlink.streams import BUILDERS, Builder
 from firmware_sim.mavlink.streams.status import system_time
-from firmware_sim.mavlink.telemetry import Ints, context_of, flown_of
+from firmware_sim.mavlink.telemetry import context_of, flown_of
 from firmware_sim.mavlink.texts import REPLY_IDS, TextEncoder
 from firmware_sim.mavlink.tick_time import TickTime
 from firmware_sim.mavlink.tlog import TlogWriter
@@ -96,6 +96,8 @@ class MavlinkServer:
                 sets one, which is forgotten with the server.
         """
         self._port: AutopilotPort | None = None
+        self._has_sample = False
+        """Whether the autopilot has had a sample."""
         self._tick_time = TickTime(clock)
         self._stored = signing
         self._signing = (
@@ -139,7 +141,7 @@ class MavlinkServer:
         """
         if self._port is not None:
             self._discard()
-        self._port = port
+        self._port, self._has_sample = port, False
         self._forget_us = 0
         self._system_id = _system_id(port)
         self._streams.attach(port, truth, self._system_id)
@@ -184,23 +186,25 @@ class MavlinkServer:
         port = self._port
         if port is None:
             return
-        if port.sample is None:
-            return
+        if not self._has_sample:
+            if port.sample is None:
+                return
+            self._has_sample = True
+        after_us = TICK_US
         if flown is None:
-            flown, times_us = flown_of(port.state()), np.array([now_us])
-        else:
-            times_us = flown["time_us"] + TICK_US
+            flown = flown_of(port.state())
+            after_us = now_us - flown["time_us"].item(0)
         self._streams.vibration.update(flown)
-        texts = list(dict.fromkeys(port.take_messages()))  # once a tick; as `_announce`
+        texts: list[Message] = port.take_messages()
+        if texts:
+            texts = list(dict.fromkeys(texts))  # once a tick; as `_announce`
         for event in port.take_events():
             self._events.add(event, now_us)
         everyone = list(self._all())
         self._send_pending(everyone, now_us)
-        for clients in self._links:
-            clients.renew()
         due = [(client, client.due(now_us)) for client in everyone if client.wakes(now_us, texts)]
         if due:
-            self._stream(due, flown, times_us, texts)
+            self._stream(due, flown, after_us, texts)
         if now_us >= self._forget_us:
             self._forget(now_us)
 
@@ -208,7 +212,7 @@ class MavlinkServer:
         self,
         due: Sequence[tuple[Client, list[str]]],
         flown: Record,
-        times_us: Ints,
+        after_us: int,
         texts: Sequence[Message],
     ) -> None:
         """Send clients texts, events and the streams that are due.
@@ -216,7 +220,7 @@ class MavlinkServer:
         Args:
             due: Clients that have something to be sent, and their slow streams.
             flown: (n,) logs of the newest ticks.
-            times_us: (n,) when they ended [µs].
+            after_us: Time from the log of a tick to its end [µs].
             texts: For operators.
         """
         assert self._port is not None  # noqa: S101 (the caller has looked)
@@ -230,7 +234,7 @@ class MavlinkServer:
             link = client.link
             if link.scheduler.fast_us <= now_us:
                 context = context_of(state) if context is None else context
-                link.stream_fast(flown, times_us, context, most)
+                link.stream_fast(flown, after_us, context, most)
             if texts or (client.events is not None and client.events.has_news(now_us)):
                 _stream_news(client, texts, now_us)
             if len(names) > share:

@@ -156,6 +156,8 @@ _FIELD_FORMAT = re.compile(r"(\d*)([a-zA-Z])")
 _LARGEST = 280
 """Bytes of the largest MAVLink 2 frame."""
 
+_NEVER: int = np.iinfo(np.int64).max
+
 
 class _Table(NamedTuple):
     """The messages as arrays: m messages, f fields of all together."""
@@ -199,7 +201,7 @@ def _table() -> _Table:
     return _Table(*(np.ascontiguousarray(column, np.int64) for column in columns))
 
 
-TABLE = _table()
+_TABLE = _table()
 NUMBERS: Mapping[str, int] = MappingProxyType({name: i for i, name in enumerate(FIELDS)})
 """Place of each message in the table."""
 
@@ -511,10 +513,10 @@ def _write(out: Bytes, at: int, kind: int, value: float, word: Vector, bits: Byt
 
 @large_kernel
 def _frame(
-    number: int, v: Vector, system: int, seq: int, out: Bytes, at: int, word: Any, bits: Bytes,
-    table: _Table,
-) -> int:  # fmt: skip
+    number: int, v: Vector, system: int, seq: int, out: Bytes, at: int, word: Any, bits: Bytes
+) -> int:
     """Write the MAVLink 2 frame of a message of the table at `at`; return where it ends."""
+    table = _TABLE
     size, start = table.sizes[number], at + 10
     for i in range(size):
         out[start + i] = 0
@@ -538,54 +540,54 @@ def _frame(
 @large_kernel
 def _pack(
     flown: Record,
-    times_us: Ints,
+    after_us: int,
     context: Vector,
-    table: _Table,
     numbers: Ints,
     due_us: Ints,
     interval_us: Ints,
     system: int,
     seq: int,
+    most: int,
     out: Bytes,
     ends: Ints,
-    v: Vector,
-    word: Any,
-    bits: Bytes,
-) -> int:
-    """Pack what is due after each tick; return the number of frames.
+) -> tuple[int, int]:
+    """Pack what is due after each tick; return the number of frames, and the next due time [µs].
 
     Args:
         flown: (n,) logs of ticks.
-        times_us: (n,) when each of them ended [µs].
+        after_us: Time from the log of a tick to its end [µs].
         context: As `context_of`.
-        table: The messages.
         numbers: (s,) place of each stream in the table; -1 = it is not there.
         due_us: (s,) next time of each stream [µs], updated.
         interval_us: (s,) its interval [µs]; 0 = off.
         system: System id of the sender.
         seq: First sequence number.
+        most: Maximum number of frames.
         out: Written: the frames, one behind the other.
-        ends: Written: where each of them ends; no more than it has room for are packed.
-        v: Scratch for the sources.
-        word: (1,) float32, and `bits` its bytes.
-        bits: (4,).
+        ends: (most,) Written: where each of them ends.
     """
-    at, n = 0, 0
+    v, word = np.empty(len(_SOURCES)), np.empty(1, np.float32)
+    bits = word.view(np.uint8)
+    at, n, next_us = 0, 0, _NEVER
     for k in range(len(flown)):
-        row, now_us, made = flown[k], times_us[k], False
+        row, made = flown[k], False
+        now_us = row.time_us + after_us
         for s in range(len(numbers)):
-            if numbers[s] < 0 or interval_us[s] == 0 or due_us[s] > now_us or n == len(ends):
+            if numbers[s] < 0 or interval_us[s] == 0 or due_us[s] > now_us or n == most:
                 continue
             late_us = now_us - due_us[s]
             due_us[s] += interval_us[s] * (1 + late_us // interval_us[s])
             if not made:
                 _sources(v, row, context)
                 made = True
-            if v[table.needs[numbers[s]]] != 0.0:
-                at = _frame(numbers[s], v, system, seq + n & 0xFF, out, at, word, bits, table)
+            if v[_TABLE.needs[numbers[s]]] != 0.0:
+                at = _frame(numbers[s], v, system, seq + n & 0xFF, out, at, word, bits)
                 ends[n] = at
                 n += 1
-    return n
+    for s in range(len(numbers)):
+        if numbers[s] >= 0 and interval_us[s] != 0:
+            next_us = min(next_us, due_us[s])
+    return n, next_us
 
 
 class Packer:
@@ -594,14 +596,11 @@ class Packer:
     def __init__(self) -> None:
         self._out = np.zeros(0, np.uint8)
         self._ends = np.zeros(0, np.int64)
-        self._values = np.zeros(len(_SOURCES))
-        self._word = np.zeros(1, np.float32)
-        self._bits = self._word.view(np.uint8)
 
     def pack(
         self,
         flown: Record,
-        times_us: Ints,
+        after_us: int,
         context: Vector,
         numbers: Ints,
         due_us: Ints,
@@ -609,27 +608,31 @@ class Packer:
         system: int,
         seq: int,
         most: int,
-    ) -> list[bytes]:
-        """Return the frames that are due after each of n ticks, `most` a tick; as `_pack`."""
+    ) -> tuple[list[bytes], int]:
+        """Return the frames that are due after each of n ticks, and the next due time [µs].
+
+        As `_pack`; `most` is the maximum number of frames per tick.
+        """
         most *= len(flown)
         if len(self._ends) < most:
             self._ends = np.zeros(most, np.int64)
             self._out = np.zeros(most * _LARGEST, np.uint8)
-        n = _pack(
-            *(flown, times_us, context, TABLE, numbers, due_us, interval_us, system, seq),
-            *(self._out, self._ends[:most], self._values, self._word, self._bits),
+        n, next_us = _pack(
+            *(flown, after_us, context, numbers, due_us, interval_us, system, seq, most),
+            *(self._out, self._ends),
         )
         if n == 0:
-            return []
+            return [], next_us
         ends = self._ends[:n].tolist()
         data = self._out[: ends[-1]].tobytes()
-        return [data[start:end] for start, end in zip([0, *ends], ends, strict=False)]
+        frames = [data[start:end] for start, end in zip([0, *ends], ends, strict=False)]
+        return frames, next_us
 
 
 def payload(name: str, state: AutopilotState) -> bytes | None:
     """Return the payload of one of the messages, without trailing zeros; None = nothing to say."""
     number, once = np.array([NUMBERS[name]]), np.ones(1, np.int64)
-    frames = Packer().pack(
-        flown_of(state), once, context_of(state), number, np.zeros(1, np.int64), once, 1, 0, 1
+    frames, _ = Packer().pack(
+        flown_of(state), 0, context_of(state), number, np.zeros(1, np.int64), once, 1, 0, 1
     )
     return frames[0][10:-2] if frames else None

@@ -49,6 +49,7 @@ class ListeningTime:
 
     def __init__(self, tick: TickTime) -> None:
         self._tick = tick
+        self._tick_us = tick.next_us
         self._left_us = LISTEN_US
         self._looked_us = 0
 
@@ -57,9 +58,13 @@ class ListeningTime:
         self._left_us = LISTEN_US
 
     def begin(self) -> None:
-        """Begin to listen."""
-        if self._tick.clock is not None:
-            self._looked_us = self._tick.clock.time_us()
+        """Begin to listen; in another tick with another tick's time."""
+        tick = self._tick
+        if tick.clock is None:
+            return
+        if self._tick_us != tick.next_us:
+            self._tick_us, self._left_us = tick.next_us, LISTEN_US
+        self._looked_us = tick.clock.time_us()
 
     def left(self) -> bool:
         """Count the time since the last look; return whether there is time for more."""

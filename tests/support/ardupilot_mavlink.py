@@ -84,7 +84,7 @@ class Manners:
             flown, context = flown_of(state), context_of(state)
             if not copter.position_ok:
                 flown["healthy"], context[:3] = 0, np.nan
-            link.stream_fast(flown, np.array([copter.time_us]), context, 16)
+            link.stream_fast(flown, copter.time_us - state.time_us, context, 16)
             if due:
                 link.stream_due(due, state, {})
             self._report_ekf(link)

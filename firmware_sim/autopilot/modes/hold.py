@@ -40,6 +40,11 @@ class Hold(FlightMode):
         """Whether hold still climbs to the altitude of a take-off that has ended."""
 
     @property
+    def is_steady(self) -> bool:
+        """Whether it holds its place."""
+        return not (self._travelling or self._settling or self._braking)
+
+    @property
     def destination(self) -> Vec | None:
         """The place, once it is known."""
         return None if self._braking else self._place.position

@@ -24,6 +24,10 @@ STANDING_M_S = 0.3
 """From this horizontal speed on the descent keeps to a place [m/s]."""
 
 
+SLOW_BELOW_M = 0.5
+"""So far below MPC_LAND_ALT2 the errors of the estimate no longer lead above it [m]."""
+
+
 class Land(FlightMode):
     """Descends where the vehicle came to rest, slower and slower as PX4 does."""
 
@@ -31,6 +35,13 @@ class Land(FlightMode):
         self._context = context
         self._place = Place((0.0, 0.0, 0.0), 0.0)
         self._stopping = False
+        self._is_slow = False
+        """Whether the descent no longer changes its speed."""
+
+    @property
+    def is_steady(self) -> bool:
+        """Whether it descends to its place at the speed of the touchdown."""
+        return self._is_slow and not self._stopping
 
     @property
     def destination(self) -> Vec | None:
@@ -45,7 +56,10 @@ class Land(FlightMode):
     def demand(self, state: Vector, _time_us: int, /) -> Demand:
         """Stop first, then hold that place; descend all the while."""
         context = self._context
-        speed = landing_speed(context.value, context.height(state), context.ground_m)
+        height_m, ground_m = context.height(state), context.ground_m
+        speed = landing_speed(context.value, height_m, ground_m)
+        low_m = context.value("MPC_LAND_ALT2") - SLOW_BELOW_M
+        self._is_slow = math.isnan(ground_m) and height_m < low_m
         if self._stopping:
             north, east, _ = triple(state, V)
             if math.hypot(north, east) > STANDING_M_S:
