@@ -29,7 +29,7 @@ class CrashDetector:
 
     def __init__(self) -> None:
         self.hit: str | None = None
-        """What was hit; None while nothing was."""
+        """Name of the first body hit; None = none."""
         self._seen = 0
 
     def look(self, simulation: Simulation) -> bool:

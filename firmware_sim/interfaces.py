@@ -69,9 +69,9 @@ class DistanceReading(NamedTuple):
 
     distance_m: float
     least_m: float
-    """What it measures at least [m]."""
+    """Minimum range [m]."""
     greatest_m: float
-    """What it measures at most [m]."""
+    """Maximum range [m]."""
     variance_m2: float = 0.0
     """0 = not told."""
     quality: int = -1
@@ -100,7 +100,7 @@ class FlowReading(NamedTuple):
 
 
 class BatterySample(NamedTuple):
-    """What a power module reports."""
+    """A sample of the power module."""
 
     voltage_v: float
     current_a: float

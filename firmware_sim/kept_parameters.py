@@ -15,7 +15,7 @@ _COLUMNS = 5
 
 
 class KeptParameters:
-    """What a vehicle's users have set, by name. Implements `parameter_store.Keeper`."""
+    """Parameters that users have set, by name. Implements `parameter_store.Keeper`."""
 
     def __init__(self, path: Path) -> None:
         """Keep them in a file that may not exist yet, in a folder that does."""

@@ -61,7 +61,7 @@ class Pacing(Protocol):
 
     @property
     def arrivals(self) -> Arrivals | None:
-        """What arrives before then; None = nothing."""
+        """Messages that arrive before then; None = none."""
         ...
 
     def restart(self, tick_us: int) -> None:

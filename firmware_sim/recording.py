@@ -1,4 +1,4 @@
-"""What is recorded of a flight; only where somebody collects the record."""
+"""The record of a flight: path, setpoints, estimates, tick lateness."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class SetpointLog:
         self._accepted: list[tuple[int, Wire]] = []
         self._motor_us: list[int] = []
         """`NO_STAMP` of those that are not flown yet."""
-        self._under_way: list[tuple[int, int, int]] = []
+        self.under_way: list[tuple[int, int, int]] = []
         """First and last setpoint that were taken in a tick, and after how many more they are
         flown: of body rates that is sooner than of a velocity that came before them."""
         self._taken = 0
@@ -50,16 +50,16 @@ class SetpointLog:
 
     def take(self, ticks_to_motors: int) -> None:
         """Note that the coming tick takes what was accepted, to be flown so many ticks later."""
-        self._under_way.append((self._taken, len(self._accepted), ticks_to_motors))
+        self.under_way.append((self._taken, len(self._accepted), ticks_to_motors))
         self._taken = len(self._accepted)
 
     def flown(self, times_us: Sequence[int]) -> None:
         """Note when motor commands were computed in the newest ticks (n,) [µs]."""
-        for first, end, ticks in self._under_way:
+        for first, end, ticks in self.under_way:
             if ticks < len(times_us):
                 self._motor_us[first:end] = [times_us[max(0, ticks)]] * (end - first)
-        left = ((first, end, ticks - len(times_us)) for first, end, ticks in self._under_way)
-        self._under_way = [entry for entry in left if entry[2] >= 0]
+        left = ((first, end, ticks - len(times_us)) for first, end, ticks in self.under_way)
+        self.under_way = [entry for entry in left if entry[2] >= 0]
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return accepted_us (n,), motor_us (n,), setpoint float32 (n, 4)."""
@@ -141,7 +141,8 @@ class FlightRecorder:
             first_us: When the first of them had its motor commands [µs].
         """
         times = truths["time_us"].tolist()
-        self.setpoints.flown([first_us + time_us - times[0] for time_us in times])
+        if self.setpoints.under_way:
+            self.setpoints.flown([first_us + time_us - times[0] for time_us in times])
         for k in self._trajectory.extend(times, truths["power_w"].tolist(), truths["motion"]):
             if self._internals is not None:
                 self._estimates.append(flown["state"][k, :RATES].copy())

@@ -51,7 +51,7 @@ _ENDS = (COLLIDED, ALIGN)
 
 @dataclass(frozen=True)
 class EpisodeSetup:
-    """What an episode is made of."""
+    """Vehicle, arena and conditions of an episode."""
 
     vehicle: VehicleProfile
     arena: Arena | None
@@ -59,9 +59,9 @@ class EpisodeSetup:
     seed: int
     """Of sensors, wind, and what is drawn of the aircraft."""
     aircraft: Aircraft = field(default_factory=Aircraft)
-    """What was asked of it: wind, spread, sensors, estimator, charge of the battery."""
+    """Wind, spread, sensors, estimator, charge of the battery."""
     computer_w: float = 0.0
-    """What the onboard computer draws from the pack [W]."""
+    """Power of the onboard computer [W]."""
     hover: HoverStart | None = None
     """How the episode begins in a hover; None = on the ground."""
 
@@ -128,10 +128,10 @@ class Simulation:
         )
         self.autopilot.use_truth(self.plant.truth)
         self.faults: FaultTimeline | None = None
-        """What fails in this episode; None: nothing does."""
+        """Faults of this episode; None = none."""
         self._fly: Callable[[SensorSample], ActuatorControls] = self.autopilot.step
         self._unaltered = self._fly
-        """What flies where nothing fails."""
+        """The step without faults."""
         self._setup = setup
         if asked.faults:
             self._let_fail(start_us)

@@ -280,7 +280,7 @@ class Health(NamedTuple):
 class AutopilotState(Protocol):
     """The autopilot after its newest tick, for whoever speaks for it; valid until the next one.
 
-    What nobody asks for need not be worked out: most ticks' streams want a few of these.
+    Implementations compute a property when it is read: most ticks need a few of them.
     """
 
     @property

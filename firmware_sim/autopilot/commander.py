@@ -164,7 +164,7 @@ COMMANDED = {
     Mode.PRECISION_LAND: _info("Precision landing", events.LANDING_PRECISELY.event()),
     Mode.RETURN: Message.of(Severity.INFO, events.RETURNING),
 }
-"""What is said when a command of its own grants a mode, armed or not; DO_SET_MODE is silent."""
+"""Texts for modes that a command of their own grants, armed or not; DO_SET_MODE is silent."""
 
 _DISARMED = _disarm(ArmingReason.COMMAND_EXTERNAL)
 _UNUSED = _disarm(ArmingReason.AUTO_DISARM_PREFLIGHT)

@@ -383,10 +383,9 @@ class Estimator:
         """Return whether height and vertical speed are valid: barometer or GPS, as above."""
         longest_us = self._value("EKF2_NOAID_TOUT")
         return self.aligned and (
-            any(
-                self._recent(m, now_us, longest_us)
-                for m in (self._baro, self._gps_vertical, self.vision.height)
-            )
+            self._recent(self._baro, now_us, longest_us)
+            or self._recent(self._gps_vertical, now_us, longest_us)
+            or self._recent(self.vision.height, now_us, longest_us)
             or (self.range is not None and self.range.told_height_since(now_us - longest_us))
         )
 
@@ -441,7 +440,8 @@ class Estimator:
 
     def _recent(self, m: Measurement, now_us: int, longest_us: float) -> bool:
         """Return whether it was fused lately; right after alignment by GPS all are."""
-        since = self._fixed_us if m.fused_us is None else m.fused_us
+        fused_us = m.fused_us
+        since = self._fixed_us if fused_us is None else fused_us
         return since is not None and now_us - since <= longest_us
 
     # --- start

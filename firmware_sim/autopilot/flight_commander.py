@@ -55,7 +55,7 @@ class FlightCommander:
         self._commanded, self._newest, self._state, self._say = commanded, newest, state, say
         self.flight = Flight()
         self.status = status_of(self.flight)
-        """What is reported of `flight`; made anew with every change."""
+        """Reported status of `flight`, replaced with every change."""
         self.refusal = ("", 0)
         """Why an offboard setpoint was refused last, and when [µs]."""
         self.armed_us = self.takeoff_us = 0
@@ -63,8 +63,7 @@ class FlightCommander:
 
     @property
     def _now_us(self) -> int:
-        sample = self._newest.sample
-        return 0 if sample is None else sample.time_us
+        return self._newest.time_us
 
     def look(self) -> None:
         """Let the failsafes look, and do what they decide."""

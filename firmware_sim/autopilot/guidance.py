@@ -29,7 +29,7 @@ class Guidance:
     def __init__(self, value: Callable[[str], float], say: Callable[[Message], None]) -> None:
         """Take a lookup of PX4 parameter names, and what tells the operators something."""
         self.context = FlightContext(value, say=say)
-        """What the modes share."""
+        """Shared by the modes."""
         self._modes = {mode: new(self.context) for mode, new in MODES.items()}
         self._flown: FlightMode = self._modes[Mode.HOLD]
         self._stopped = False

@@ -36,6 +36,11 @@ class NewestSensors:
         return self._fix
 
     @property
+    def time_us(self) -> int:
+        """Of the newest sample [µs]; 0 before the first."""
+        return self._record["time_us"].item(0)
+
+    @property
     def esc_outputs(self) -> Motors | None:
         """Reported motor outputs, 0..1; None = the newest sample has none."""
         # A compiled tick measures none.

@@ -24,9 +24,9 @@ class Check(NamedTuple):
     part: Part
     fails: Callable[[Readiness], bool]
     text: str
-    """What the operator is told."""
+    """Text for the operator."""
     event: CheckEvent
-    """What ground stations are told of it."""
+    """Its event for ground stations."""
     said: bool = True
     """Whether PX4 says it by itself when it begins to fail; else only when arming is refused."""
     blocks: Callable[[Readiness], bool] | None = None

@@ -35,6 +35,10 @@ LEARN_US = US_PER_S
 """A sensor that never repeated itself for so long, at rest, has noise [µs]."""
 
 
+CALM_US = 300_000
+"""No kind of sensor fails before its newest sample is as old as this [µs]."""
+
+
 @dataclass(frozen=True, slots=True)
 class SensorKind:
     """One sensor, and when it is given up."""
@@ -99,7 +103,7 @@ class SensorWatch:
         self.kind = kind
         self._value: Any = None
         self._times = times
-        self._noisy: bool | None = None
+        self.noisy: bool | None = None
         """Whether its samples differ at rest, too; None = not known yet."""
         self.repeats = False
         """Whether its newest sample is exactly the one before."""
@@ -113,7 +117,7 @@ class SensorWatch:
         times = self._times
         times[SEEN] = now_us
         if self.repeats:
-            self._noisy = self._noisy or False
+            self.noisy = self.noisy or False
             return
         self._value, times[CHANGED] = value, now_us
         if times[FIRST] < 0:
@@ -122,7 +126,7 @@ class SensorWatch:
     def repeat(self, now_us: int) -> None:
         """Note that its newest sample, which a compiled tick took, is that before."""
         self.repeats, self._times[SEEN] = True, now_us
-        self._noisy = self._noisy or False
+        self.noisy = self.noisy or False
 
     def judge(self, now_us: int, times_us: Sequence[int], *, flying: bool) -> Message | None:
         """Return a text when it fails now; `times_us` is its row of `watch`.
@@ -132,9 +136,9 @@ class SensorWatch:
         seen_us, changed_us, first_us = times_us
         if seen_us < 0:
             return None
-        if self._noisy is None and first_us >= 0 and seen_us - first_us >= LEARN_US:
-            self._noisy = True
-        if not (flying or self._noisy):
+        if self.noisy is None and first_us >= 0 and seen_us - first_us >= LEARN_US:
+            self.noisy = True
+        if not (flying or self.noisy):
             self._times[CHANGED] = changed_us = seen_us
         before, self.failed = self.failed, ""
         if now_us - seen_us > self.kind.timeout_us:
@@ -215,6 +219,8 @@ class SensorMonitor:
         self.accel.take(sample)
         texts: list[Message] = []
         for watch, times_us in zip(self.all, self._times.tolist(), strict=True):
+            if watch.noisy and not watch.failed and now_us - times_us[CHANGED] < CALM_US:
+                continue  # Most of the time: it has measured something new.
             text = watch.judge(now_us, times_us, flying=flying)
             if text is not None:
                 texts.append(text)

@@ -6,42 +6,33 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
 
 from airl_mav.control.demand import AnyDemand, AttitudeDemand, RateDemand
-from airl_mav.control.mixer import Motors
-from airl_mav.core.frames import Geodetic
 from firmware_sim.autopilot.autopilot_state import (
     Clearance,
     CommanderStatus,
-    Estimate,
-    FenceStatus,
     Health,
-    MissionProgress,
     Mode,
     OrbitStatus,
     Setpoint,
-    Vector,
 )
 from firmware_sim.autopilot.estimator import Estimator
 from firmware_sim.autopilot.failsafes.supervisor import Supervisor
 from firmware_sim.autopilot.flight_commander import FlightCommander
 from firmware_sim.autopilot.guidance import Guidance
 from firmware_sim.autopilot.home import Home
-from firmware_sim.autopilot.manual_control import Sticks
 from firmware_sim.autopilot.navigation.navigator import Navigator
 from firmware_sim.autopilot.navigation.plan import Plans
 from firmware_sim.autopilot.navigation.progress import progress
 from firmware_sim.autopilot.newest_sensors import NewestSensors
 from firmware_sim.engine.controller import Controller, ControlSetpoints
 from firmware_sim.interfaces import (
-    BatterySample,
     DistanceReading,
     FlowReading,
-    GpsFix,
-    Odometry,
     SensorSample,
 )
 
@@ -82,13 +73,8 @@ class Snapshot:
         self._controlled: ControlSetpoints | None = None
         self._health: Health | None = None
 
-    @property
-    def motors(self) -> Motors:
-        return self._parts.controller.motors
-
-    @property
-    def estimate(self) -> Estimate:
-        return self._parts.estimator.estimate()
+    motors = property(attrgetter("_parts.controller.motors"))
+    estimate = property(lambda self: self._parts.estimator.estimate())
 
     @property
     def setpoint(self) -> Setpoint:
@@ -97,69 +83,22 @@ class Snapshot:
             return Setpoint(self.estimate.position, velocity, math.nan, 0.0)
         return Setpoint(np.array(demand.position), velocity, demand.yaw, demand.yaw_rate)
 
-    @property
-    def attitude_setpoint(self) -> Vector:
-        return self._setpoints.attitude
-
-    @property
-    def rate_setpoint(self) -> Vector:
-        return self._setpoints.rates
-
-    @property
-    def thrust_setpoint(self) -> float:
-        return self._setpoints.thrust
-
-    @property
-    def accel(self) -> Vector:
-        return self._sample.accel
-
-    @property
-    def gyro(self) -> Vector:
-        return self._sample.gyro
-
-    @property
-    def mag(self) -> Vector:
-        return self._parts.newest.mag
-
-    @property
-    def pressure_hpa(self) -> float:
-        return self._parts.newest.pressure_hpa
-
-    @property
-    def temperature_c(self) -> float:
-        return self._sample.temperature_c
-
-    @property
-    def battery(self) -> BatterySample:
-        return self._sample.battery
-
-    @property
-    def gps(self) -> GpsFix | None:
-        return self._parts.newest.gps
-
-    @property
-    def home(self) -> Geodetic | None:
-        return self._parts.home.place
-
-    @property
-    def origin(self) -> Geodetic | None:
-        return self._parts.estimator.origin
-
-    @property
-    def armed_us(self) -> int:
-        return self._parts.commander.armed_us
-
-    @property
-    def takeoff_us(self) -> int:
-        return self._parts.commander.takeoff_us
-
-    @property
-    def mission(self) -> MissionProgress:
-        return progress(self._parts.plans)
-
-    @property
-    def fence(self) -> FenceStatus:
-        return self._parts.navigator.fence.status
+    attitude_setpoint = property(attrgetter("_setpoints.attitude"))
+    rate_setpoint = property(attrgetter("_setpoints.rates"))
+    thrust_setpoint = property(attrgetter("_setpoints.thrust"))
+    accel = property(attrgetter("_sample.accel"))
+    gyro = property(attrgetter("_sample.gyro"))
+    mag = property(attrgetter("_parts.newest.mag"))
+    pressure_hpa = property(attrgetter("_parts.newest.pressure_hpa"))
+    temperature_c = property(attrgetter("_sample.temperature_c"))
+    battery = property(attrgetter("_sample.battery"))
+    gps = property(attrgetter("_parts.newest.gps"))
+    home = property(attrgetter("_parts.home.place"))
+    origin = property(attrgetter("_parts.estimator.origin"))
+    armed_us = property(attrgetter("_parts.commander.armed_us"))
+    takeoff_us = property(attrgetter("_parts.commander.takeoff_us"))
+    mission = property(lambda self: progress(self._parts.plans))
+    fence = property(attrgetter("_parts.navigator.fence.status"))
 
     @property
     def orbit(self) -> OrbitStatus | None:
@@ -172,33 +111,17 @@ class Snapshot:
             self._health = self._parts.supervisor.health(self.time_us)
         return self._health
 
-    @property
-    def hover_thrust(self) -> float:
-        return self._parts.value("MPC_THR_HOVER")
+    hover_thrust = property(lambda self: self._parts.value("MPC_THR_HOVER"))
 
     @property
     def destination(self) -> tuple[float, float, float] | None:
         return None if self._demand is None else self._parts.guidance.destination
 
-    @property
-    def home_yaw(self) -> float:
-        return self._parts.guidance.context.home_yaw
-
-    @property
-    def sticks(self) -> Sticks | None:
-        return self._parts.guidance.context.sticks
-
-    @property
-    def esc_outputs(self) -> tuple[float, float, float, float] | None:
-        return self._parts.newest.esc_outputs
-
-    @property
-    def odometry(self) -> Odometry | None:
-        return self._parts.estimator.odometry
-
-    @property
-    def odometry_us(self) -> int:
-        return self._parts.estimator.odometry_us
+    home_yaw = property(attrgetter("_parts.guidance.context.home_yaw"))
+    sticks = property(attrgetter("_parts.guidance.context.sticks"))
+    esc_outputs = property(attrgetter("_parts.newest.esc_outputs"))
+    odometry = property(attrgetter("_parts.estimator.odometry"))
+    odometry_us = property(attrgetter("_parts.estimator.odometry_us"))
 
     @property
     def distance(self) -> DistanceReading | None:

@@ -67,6 +67,8 @@ AIRCRAFT = np.dtype(
         ("start_us", _I),
         ("moves_us", _I),
         ("closing_m_s", _F),  # greatest speed of an obstacle
+        ("reach_m", _F),  # from the centre to its farthest part
+        ("clear_m", _F),  # contacts are impossible beyond
         ("footing_m", _F),  # from the centre to the nearest edge that it may tip over
         # True state.
         ("ticks", _I),

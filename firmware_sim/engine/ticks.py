@@ -86,9 +86,6 @@ EVENT_BITS = 4
 
 EVENT_MASK = (1 << EVENT_BITS) - 1
 
-ROOM_M = 0.15
-"""Contacts are impossible in a tick that begins with more room: 37 m/s in 4 ms [m]."""
-
 FRICTION = 0.8
 """Of the body on the floor, as `plant.bullet_body` has it."""
 
@@ -287,6 +284,28 @@ def _turning(a: Fields, c: Fields) -> Speeds:
 
 
 @kernel
+def _nearing_m(a: Fields) -> float:
+    """Return how much nearer any of its parts may come to anything in a tick [m]."""
+    v, w = velocity(a.motion), rates(a.motion)
+    speed = math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+    spin = math.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
+    nearing: float = a.tick_s * (a.closing_m_s + speed + a.reach_m * spin)
+    return nearing
+
+
+@kernel
+def _is_clear(a: Fields) -> bool:
+    """Return whether contacts are impossible in the coming tick."""
+    return bool(a.room_m > a.clear_m + _nearing_m(a))
+
+
+@kernel
+def is_clear_record(aircraft: Record) -> bool:
+    """Return whether contacts are impossible in the coming tick of a record (1,)."""
+    return _is_clear(aircraft[0])
+
+
+@kernel
 def _glide(a: Fields, c: Fields, wind: Vector, after: Vector) -> None:
     """Move an aircraft that touches nothing by one tick; `after` (16,) is scratch."""
     before, dt = a.motion, a.tick_s
@@ -299,7 +318,7 @@ def _glide(a: Fields, c: Fields, wind: Vector, after: Vector) -> None:
         q_new = (-q_new[0], -q_new[1], -q_new[2], -q_new[3])
     write(p, v, q_new, omega, before, dt, after)
     finish(a, after, wind, False)
-    a.room_m -= dt * (a.closing_m_s + math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2]))
+    a.room_m -= _nearing_m(a)
 
 
 @kernel
@@ -319,7 +338,7 @@ def _rest(a: Fields, motors: Speeds, wind: Vector, after: Vector) -> None:
         after[i] = row[i]
     after[13], after[14], after[15] = rotate(conjugate(quaternion(row)), (0.0, 0.0, -GRAVITY_M_S2))
     finish(a, after, wind, True)
-    a.room_m -= a.tick_s * a.closing_m_s
+    a.room_m -= _nearing_m(a)
 
 
 @kernel
@@ -700,7 +719,7 @@ def stretch(
             or (not steady and at[_WIND] >= len(wind))
         ):
             return k << EVENT_BITS | NOISE
-        if not a.room_m > ROOM_M or (a.resting != 0 and a.held == 0):
+        if not _is_clear(a) or (a.resting != 0 and a.held == 0):
             return k << EVENT_BITS | ROOM
         row = flown[k]
         command(c, row)

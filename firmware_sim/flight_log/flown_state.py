@@ -67,50 +67,16 @@ class FlownState:
         yaw = 6 if kind == POSITION_DEMAND else 9
         return Setpoint(demand[:3], velocity, float(demand[yaw]), float(demand[yaw + 1]))
 
-    @property
-    def attitude_setpoint(self) -> Vector:
-        return self._output(0, 4)
-
-    @property
-    def rate_setpoint(self) -> Vector:
-        return self._output(4, 7)
-
-    @property
-    def thrust_setpoint(self) -> float:
-        return float(self._tick["output"][10])
-
-    @property
-    def accel(self) -> Vector:
-        return self._vector("accel")
-
-    @property
-    def gyro(self) -> Vector:
-        return self._vector("gyro")
-
-    @property
-    def mag(self) -> Vector:
-        return self._vector("mag")
-
-    @property
-    def pressure_hpa(self) -> float:
-        return float(self._tick["pressure_hpa"])
-
-    @property
-    def temperature_c(self) -> float:
-        return float(self._tick["temperature_c"])
-
-    @property
-    def motors(self) -> tuple[float, float, float, float]:
-        a, b, c, d = self._tick["motors"].tolist()
-        return a, b, c, d
-
-    @property
-    def battery(self) -> BatterySample:
-        return BatterySample(*self._tick["battery"].tolist())
-
-    def _vector(self, name: str) -> Vector:
-        values: Vector = self._tick[name].copy()
-        return values
+    attitude_setpoint = property(lambda self: self._output(0, 4))
+    rate_setpoint = property(lambda self: self._output(4, 7))
+    thrust_setpoint = property(lambda self: self._tick["output"].item(10))
+    accel = property(lambda self: self._tick["accel"].copy())
+    gyro = property(lambda self: self._tick["gyro"].copy())
+    mag = property(lambda self: self._tick["mag"].copy())
+    pressure_hpa = property(lambda self: self._tick["pressure_hpa"].item())
+    temperature_c = property(lambda self: self._tick["temperature_c"].item())
+    motors = property(lambda self: tuple(self._tick["motors"].tolist()))
+    battery = property(lambda self: BatterySample(*self._tick["battery"].tolist()))
 
     def _output(self, first: int, end: int) -> Vector:
         values: Vector = self._tick["output"][first:end].copy()

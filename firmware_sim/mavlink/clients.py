@@ -59,7 +59,7 @@ class Client:
     """When it last sent a valid frame, in simulated time [µs]."""
     allowance: Allowance = field(default_factory=Allowance)
     forwards: Allowance = field(default_factory=lambda: Allowance(FORWARDS_PER_S, FORWARDS_PER_S))
-    """What of it is passed on to others."""
+    """Limits the frames that are passed on to others."""
     late: list[str] = field(default_factory=list)
     """Streams that have found no room in their tick."""
     components: set[tuple[int, int]] = field(default_factory=set)
@@ -122,7 +122,7 @@ class Clients:
         self._listening = ListeningTime(tick_time)
         self._signing = signing
         self._backlog: deque[tuple[Client, WireMessage]] = deque()
-        """What was decoded when the link's time of the tick was spent."""
+        """Decoded messages that wait for the next tick."""
         self._clients: dict[Peer, Client] = {}
         self._doorkeeper = Decoder(datagrams=endpoint.datagrams)
         """Reads what nobody known has sent."""

@@ -34,7 +34,7 @@ empty = the values do not fit."""
 
 @dataclass(frozen=True, slots=True)
 class LinkConfig:
-    """What a link is made of."""
+    """Endpoint and streams of a link."""
 
     name: str
     endpoint: SharedEndpoint

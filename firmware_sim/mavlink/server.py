@@ -6,8 +6,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import chain
 
-import numpy as np
-
 from airl_mav.core.clock import Clock
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.frames import Vector

@@ -1,4 +1,4 @@
-"""What part of a tick's time goes into MAVLink that can wait: what arrives, and bulk transfers.
+"""Time budget of a tick for MAVLink that can wait: arrivals and bulk transfers.
 
 A tick is late where this takes too long. In the time that is left before the next tick it makes
 nothing late, so there is more room for it there.

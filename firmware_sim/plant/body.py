@@ -20,7 +20,7 @@ CEILING = "ceiling"
 
 
 class Touch(NamedTuple):
-    """What the vehicle has contacts with, by the numbers of the bodies."""
+    """Bodies in contact with the vehicle, by number."""
 
     close: frozenset[int]
     """Nearer than the contact threshold: a contact that was pressed lasts as long."""
@@ -36,12 +36,12 @@ class Body(Protocol):
 
     @property
     def names(self) -> Mapping[int, str]:
-        """What each body is called in a collision event, by its number."""
+        """Name of each body in a collision event, by number."""
         ...
 
     @property
     def touch(self) -> Touch:
-        """What it touched in the newest tick."""
+        """Contacts in the newest tick."""
         ...
 
     def move(self, at: Vec, force: Vec, torque: Vec, before: Vector, moving_us: int) -> Vector:
@@ -57,11 +57,6 @@ class Body(Protocol):
         Returns:
             (16,) the motion after the tick, as `plant.kinematics`; a new array.
         """
-        ...
-
-    @property
-    def radius_m(self) -> float:
-        """Half diagonal of its collision box [m]."""
         ...
 
     def follow(self, motion: Vector) -> None:

@@ -54,9 +54,7 @@ class BulletBody:
         """
         self._made_of = arena, body, airframe, tick_s
         diagonal_m = math.hypot(body.width_m, body.width_m, body.height_m)
-        self.radius_m = 0.5 * diagonal_m
-        """Half diagonal of its collision box [m]."""
-        self.world = World(arena, self.radius_m, tick_s)
+        self.world = World(arena, 0.5 * diagonal_m, tick_s)
         self._tick_s = tick_s
         self.number = self._build(body, airframe)
         """pybullet's number of it."""
@@ -64,7 +62,7 @@ class BulletBody:
 
     @property
     def names(self) -> Mapping[int, str]:
-        """What each body is called in a collision event, by pybullet's number."""
+        """Name of each body in a collision event, by pybullet's number."""
         return self.world.names
 
     def close(self) -> None:

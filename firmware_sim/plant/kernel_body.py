@@ -31,7 +31,7 @@ _FIRST = FLOOR_ID + 1
 
 
 class State(NamedTuple):
-    """What is remembered of contacts from tick to tick; updated in place."""
+    """Contacts kept from tick to tick; updated in place."""
 
     kept: Vector  # (KEPT, 7) points on the floor
     many: NDArray[np.int64]  # (1,) how many
@@ -158,7 +158,7 @@ class KernelBody:
         self._solids, names = solids_of(arena)
         self.names: Mapping[int, str] = dict(enumerate([FLOOR, *names], start=FLOOR_ID))
         self._half = np.array([0.5 * body.width_m, 0.5 * body.width_m, 0.5 * body.height_m])
-        self.radius_m = radius = float(np.linalg.norm(self._half))
+        radius = float(np.linalg.norm(self._half))
         """Half diagonal of its collision box [m]."""
         self._box = radius, BREAKING_SHARE * radius
         self._airframe = np.array(airframe)

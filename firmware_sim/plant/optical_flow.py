@@ -59,7 +59,7 @@ class PlantOpticalFlow:
             profile: What it is.
             arena: Where; None = an endless floor.
             rng: Of its noise, and of nothing else.
-            times: What its noise is multiplied by.
+            times: Factor of its noise.
             tick_s: Length of a tick [s].
         """
         self.rate = Rate(profile.rate_hz)

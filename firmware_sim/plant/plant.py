@@ -30,10 +30,10 @@ from firmware_sim.engine.ticks import (
     NOISE,
     NONE,
     ROOM,
-    ROOM_M,
     begin_touch,
     end_touch,
     finish_record,
+    is_clear_record,
     push_record,
     rest_record,
     stretch,
@@ -41,6 +41,7 @@ from firmware_sim.engine.ticks import (
 from firmware_sim.interfaces import ActuatorControls, BatterySample, SensorSample, Truth
 from firmware_sim.plant.bodies import new_body
 from firmware_sim.plant.body import FLOOR, Body, Touch
+from firmware_sim.plant.contacts.box import BREAKING_SHARE
 from firmware_sim.plant.optical_flow import PlantOpticalFlow
 from firmware_sim.plant.rangefinder import PlantRangefinder
 from firmware_sim.plant.room import Room
@@ -51,6 +52,10 @@ REST_SPEED_M_S = 0.1
 
 STILL = 1e-4
 """A vehicle rests below this speed [m/s] and turn rate [rad/s]."""
+
+CLEAR_M = 0.03
+"""Contacts are impossible in a tick if nothing comes nearer in it than this, beyond the distance at
+which the physics begins contacts (`BREAKING_SHARE`) [m]."""
 
 NEVER_US = 1 << 61
 """Begin of the tours of obstacles that stand still [µs]."""
@@ -132,8 +137,8 @@ class Plant:
         """Share of an error of its speed that a rotor keeps over a tick."""
         pack, power_w = pack_row(profile.battery), standing_power_w(0.0, airframe, model)
         self.body: Body = new_body(asked.plant, arena, profile.body, airframe, tick_s)
-        """What is moved among the bodies of the arena."""
-        self._room = Room(arena, self.body.radius_m)
+        """The vehicle among the bodies of the arena."""
+        self._room = Room(arena, profile.body)
         for name, value in (
             ("airframe", airframe),
             ("power_model", model),
@@ -145,6 +150,8 @@ class Plant:
             ("start_us", start_us),
             ("moves_us", start_us),
             ("closing_m_s", self._room.closing_m_s),
+            ("reach_m", self._room.reach_m),
+            ("clear_m", CLEAR_M + BREAKING_SHARE * self._room.reach_m),
             ("footing_m", 0.5 * profile.body.width_m),
             ("held", 1),
             ("time_us", start_us),
@@ -317,10 +324,14 @@ class Plant:
 
     def _measure_room(self) -> bool:
         """Measure how far everything is that can be touched; return whether that is far enough."""
-        self.record["resting"] = 0
-        room_m = -math.inf if self._touching else self._room.measure(self._motion, self._elapsed_us)
-        self.record["room_m"] = room_m
-        return room_m > ROOM_M
+        record = self.record
+        record["resting"] = 0
+        record["room_m"] = -math.inf if self._touching else self._room.above_floor_m(self._motion)
+        if not is_clear_record(record):
+            return False
+        solids_m = self._room.among_solids_m(self._motion, self._elapsed_us)
+        record["room_m"] = min(record["room_m"].item(0), solids_m)
+        return is_clear_record(record)
 
     # --- ticks by Python
 
@@ -334,7 +345,7 @@ class Plant:
         record = self.record
         # An empty battery turns no motor.
         motors = motors if record["charge"][0] > 0.0 else STOPPED
-        if record["resting"][0] and record["room_m"][0] > ROOM_M and record["held"][0]:
+        if record["resting"][0] and record["held"][0] and is_clear_record(record):
             rest_record(record, motors, wind)
             return
         after = self._moved(*push_record(record, motors, wind))
@@ -366,9 +377,9 @@ class Plant:
             return False
         if np.maximum.reduce(np.abs(motion[[3, 4, 5, 10, 11, 12]])) > STILL:
             return False
-        room_m = self._room.measure_solids(self._motion, self._elapsed_us)
-        record["resting"], record["room_m"] = room_m > ROOM_M, room_m
-        return room_m > ROOM_M
+        record["room_m"] = self._room.among_solids_m(self._motion, self._elapsed_us)
+        record["resting"] = resting = is_clear_record(record)
+        return resting
 
     def sense(self) -> SensorSample:
         """Return a sensor sample of the present state."""

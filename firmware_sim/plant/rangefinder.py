@@ -28,7 +28,7 @@ class PlantRangefinder:
             profile: What it is.
             arena: Where; None = an endless floor.
             rng: Of its noise, and of nothing else.
-            times: What its noise is multiplied by; what it says of its variance stays.
+            times: Factor of its noise; the variance that it reports stays.
         """
         self.rate = Rate(profile.rate_hz)
         self._profile = profile

@@ -2,44 +2,60 @@
 
 from __future__ import annotations
 
+import math
+
+import numpy as np
+
 from airl_mav.arena.geometry import Arena
 from airl_mav.arena.ground import TOP
 from airl_mav.core.frames import Vector
 from airl_mav.core.kernels import kernel
+from airl_mav.profiles.vehicle import Body
+from firmware_sim.engine.kinematics import quaternion
+from firmware_sim.plant.contacts.box import reach_along
 from firmware_sim.plant.solids import Solids, greatest_speed, room_among, solids_of
 from firmware_sim.plant.tours import place_at
 
 
 class Room:
-    """Bodies of an arena, for distances to a sphere around the vehicle."""
+    """Distances from a vehicle's collision box to the bodies of an arena."""
 
-    def __init__(self, arena: Arena | None, radius_m: float) -> None:
-        """Take an arena, None = an endless floor, and the radius of the sphere [m]."""
+    def __init__(self, arena: Arena | None, body: Body) -> None:
+        """Take an arena, None = an endless floor, and the body."""
         self._solids, _ = solids_of(arena)
-        self._radius_m = radius_m
+        relief = self._solids.relief
+        self._top_m = float(relief.grid[TOP]) if len(relief.heights) else 0.0
+        """Height of the highest hill."""
+        self._half = 0.5 * np.array([body.width_m, body.width_m, body.height_m])
+        self.reach_m = math.hypot(*self._half.tolist())
+        """From the centre of the box to its corners."""
         self.closing_m_s = greatest_speed(self._solids)
         """Greatest speed of an obstacle [m/s]."""
 
-    def measure(self, motion: Vector, moving_us: int) -> float:
-        """Return a distance that nothing is nearer than [m].
+    def above_floor_m(self, motion: Vector) -> float:
+        """Return the height of the box's lowest corner above floor and hills [m]; motion (16,)."""
+        lowest_m: float = _lowest(motion, self._half)
+        return lowest_m - self._top_m
+
+    def among_solids_m(self, motion: Vector, moving_us: int) -> float:
+        """Return a distance that no wall and no obstacle is nearer than [m].
 
         Args:
             motion: (16,) of the vehicle.
             moving_us: How long what moves has been under way [µs].
         """
-        solids = self._solids
-        top_m = solids.relief.grid[TOP] if len(solids.relief.heights) else 0.0
-        above_m = -motion[2] - self._radius_m - top_m
-        return min(self.measure_solids(motion, moving_us), float(above_m))
-
-    def measure_solids(self, motion: Vector, moving_us: int) -> float:
-        """Return a distance that no wall and no obstacle is nearer than [m]; as `measure`."""
-        room: float = _measure(self._solids, motion, self._radius_m, moving_us)
+        room: float = _among_solids(self._solids, motion, self.reach_m, moving_us)
         return room
 
 
 @kernel
-def _measure(solids: Solids, motion: Vector, radius: float, moving_us: int) -> float:
+def _lowest(motion: Vector, half: Vector) -> float:
+    lowest_m: float = -motion[2] - reach_along(quaternion(motion), half, (0.0, 0.0, 1.0))
+    return lowest_m
+
+
+@kernel
+def _among_solids(solids: Solids, motion: Vector, radius: float, moving_us: int) -> float:
     n, moving = len(solids.shape), len(solids.leg)
     for i in range(moving):
         north, east = place_at(moving_us, solids.times_s, solids.points, solids.leg, i)

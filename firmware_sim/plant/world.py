@@ -60,7 +60,7 @@ class World:
         self.client.setGravity(0.0, 0.0, -GRAVITY_M_S2)
         self.client.setTimeStep(tick_s)
         self.names: dict[int, str] = {}
-        """What each body is called in a collision event."""
+        """Name of each body in a collision event."""
         self._movers: Movers | None = None
         floor = self.client.createCollisionShape(pybullet.GEOM_PLANE)
         self._add(floor, np.zeros(3), LEVEL, FLOOR)

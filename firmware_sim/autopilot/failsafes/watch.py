@@ -240,6 +240,8 @@ class Watch:
     def _lasts_too_short(self, sample: SensorSample, *, armed: bool) -> bool:
         """Return whether the battery lasts no longer than a return takes."""
         p, needed_s = self.settings, self.reports.return_time_s
+        if p.bat1_capacity <= 0.0:
+            return False
         left_s = self._endurance.update(
             sample.time_us, sample.battery, p.bat1_capacity, p.bat_avrg_current, armed=armed
         )

@@ -23,7 +23,6 @@ from firmware_sim.autopilot.modes.interface import (
     FlightContext,
     FlightMode,
     OffboardSetpoint,
-    triple,
 )
 from firmware_sim.autopilot.requests import Request
 
@@ -106,14 +105,18 @@ def demand_of(setpoint: Setpoint) -> Demand | TrajectoryDemand:
     Each axis needs a position, a velocity or an acceleration, and north and east come in pairs;
     otherwise the vehicle hovers. Source: PX4 1.16, PositionControl::inputValid.
     """
-    position, velocity = triple(setpoint.position, 0), triple(setpoint.velocity, 0)
-    acceleration = triple(setpoint.acceleration, 0)
+    isnan, position = math.isnan, tuple(setpoint.position.tolist())
+    velocity, acceleration = (
+        tuple(setpoint.velocity.tolist()),
+        tuple(setpoint.acceleration.tolist()),
+    )
     if not _is_valid(position, velocity, acceleration):
         return HOVER._replace(yaw=setpoint.yaw, yaw_rate=setpoint.yaw_rate)
-    if all(map(math.isnan, acceleration)):
+    if all(map(isnan, acceleration)):
         # A velocity that is not commanded adds nothing to a position.
-        north, east, down = (0.0 if math.isnan(speed) else speed for speed in velocity)
-        return Demand(position, (north, east, down), setpoint.yaw, setpoint.yaw_rate)
+        vn, ve, vd = velocity
+        rest = 0.0 if isnan(vn) else vn, 0.0 if isnan(ve) else ve, 0.0 if isnan(vd) else vd
+        return Demand(position, rest, setpoint.yaw, setpoint.yaw_rate)
     return TrajectoryDemand(position, velocity, acceleration, setpoint.yaw, setpoint.yaw_rate)
 
 

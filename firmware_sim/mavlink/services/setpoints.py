@@ -15,11 +15,9 @@ from airl_mav.control.demand import AttitudeDemand, RateDemand
 from airl_mav.core.frames import (
     Geodetic,
     geodetic_to_local,
-    heading_to_ned,
     quat_to_euler,
-    quat_yaw,
 )
-from airl_mav.vehicle.rotation import rotate
+from airl_mav.vehicle.rotation import rotate, yaw_of
 from firmware_sim.autopilot.autopilot_state import Message, Setpoint, Severity, Vector, Wire
 from firmware_sim.autopilot.events import command_events as events
 from firmware_sim.mavlink.codec import WireMessage, dialect
@@ -184,7 +182,10 @@ def _masked(values: tuple[float, float, float], ignore: int) -> Vector:
 
 def _turned(velocity: Vector, quaternion: Vector) -> Vector:
     """Turn a velocity (3,) by the heading."""
-    return heading_to_ned(velocity, quat_yaw(quaternion))
+    forward, right, down = velocity.tolist()
+    yaw = yaw_of(tuple(quaternion.tolist()))
+    c, s = math.cos(yaw), math.sin(yaw)
+    return np.array([c * forward - s * right, s * forward + c * right, down])
 
 
 def _commands_something(*vectors: Vector) -> bool:
