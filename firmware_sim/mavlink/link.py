@@ -278,7 +278,7 @@ class Link:
         Args:
             flown: (n,) logs of the ticks.
             after_us: Time from the log of a tick to its end [µs].
-            context: As `telemetry.context_of`.
+            context: As `telemetry.TickContext.of`.
             most: Frames a tick, at most.
         """
         plan, encoder = self.scheduler, self._stream_encoder

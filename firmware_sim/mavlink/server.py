@@ -30,7 +30,7 @@ from firmware_sim.mavlink.services.context import Context
 from firmware_sim.mavlink.services.transfers import RunningCalibration
 from firmware_sim.mavlink.streams import BUILDERS, Builder
 from firmware_sim.mavlink.streams.status import system_time
-from firmware_sim.mavlink.telemetry import context_of, flown_of
+from firmware_sim.mavlink.telemetry import TickContext, flown_of
 from firmware_sim.mavlink.texts import REPLY_IDS, TextEncoder
 from firmware_sim.mavlink.tick_time import TickTime
 from firmware_sim.mavlink.tlog import TlogWriter
@@ -107,7 +107,7 @@ class MavlinkServer:
         self._now_us = 0
         self._forget_us = 0
         self._system_id = SYSTEM_ID
-        self._streams = OwnStreams()
+        self._streams, self._context = OwnStreams(), TickContext()
         self._texts: list[Message] = []
         self._announced = Allowance(TEXTS_PER_S, TEXTS_BURST)
         self._answers_apart = any(config.separate_replies for config in links)
@@ -231,7 +231,7 @@ class MavlinkServer:
         for client, names in due:
             link = client.link
             if link.scheduler.fast_us <= now_us:
-                context = context_of(state) if context is None else context
+                context = self._context.of(state) if context is None else context
                 link.stream_fast(flown, after_us, context, most)
             if texts or (client.events is not None and client.events.has_news(now_us)):
                 _stream_news(client, texts, now_us)

@@ -222,33 +222,37 @@ _CRC = _crc_table()
 # What stays the same while compiled ticks are flown.
 _LATITUDE, _LONGITUDE, _ORIGIN_M, _HOME_M, _ARMED, _HOVER, _TERRAIN, _CLEARANCE = range(8)
 _GOAL, _FIX, _ESCS = 8, 11, 15
-_CONTEXT_SIZE = 19
+_UNKNOWN = (math.nan,) * 4
 
 
-def context_of(state: AutopilotState) -> Vector:
-    """Return what the messages need besides a tick's log (19,); NaN = not known.
+class TickContext:
+    """Values of the messages that are not in a tick's log, kept until one of them changes."""
 
-    That is origin, height of home, arming, hover thrust, ground below, destination (local NED),
-    type, satellites and accuracies of the newest fix, and what speed controllers report.
-    """
-    context = np.full(_CONTEXT_SIZE, math.nan)
-    origin, home, goal, fix = state.origin, state.home, state.destination, state.gps
-    if origin is not None:
-        context[:_HOME_M] = origin
-        if goal is not None:
-            context[_GOAL:_FIX] = goal
-    if home is not None:
-        context[_HOME_M] = home.altitude_m
-    if fix is not None:
-        context[_FIX:_ESCS] = fix.fix_type, fix.satellites, fix.eph_m, fix.epv_m
-    if (outputs := state.esc_outputs) is not None:
-        context[_ESCS:] = outputs
-    context[_ARMED] = state.status.arming is Arming.ARMED
-    context[_HOVER] = state.hover_thrust
-    if state.clearance is not None:
-        down = float(state.estimate.position[2])
-        context[_TERRAIN], context[_CLEARANCE] = clearance(state, down)
-    return context
+    def __init__(self) -> None:
+        self._values: tuple[float, ...] = ()
+        self._row = np.zeros(0)
+
+    def of(self, state: AutopilotState) -> Vector:
+        """Return the values (19,); NaN = not known.
+
+        Origin, height of home, arming, hover thrust, ground below, destination (local NED), type,
+        satellites and accuracies of the newest fix, outputs that the speed controllers report.
+        """
+        origin, home, goal, fix = state.origin, state.home, state.destination, state.gps
+        ground = state.clearance
+        values = (
+            *(_UNKNOWN[:3] if origin is None else origin),
+            math.nan if home is None else home.altitude_m,
+            state.status.arming is Arming.ARMED,
+            state.hover_thrust,
+            *(_UNKNOWN[:2] if ground is None else clearance(state, state.estimate.position[2])),
+            *(_UNKNOWN[:3] if goal is None or origin is None else goal),
+            *(_UNKNOWN if fix is None else (fix.fix_type, fix.satellites, fix.eph_m, fix.epv_m)),
+            *(state.esc_outputs or _UNKNOWN),
+        )
+        if values != self._values:
+            self._values, self._row = values, np.array(values, np.float64)
+        return self._row
 
 
 def flown_of(state: AutopilotState) -> Record:
@@ -556,7 +560,7 @@ def _pack(
     Args:
         flown: (n,) logs of ticks.
         after_us: Time from the log of a tick to its end [µs].
-        context: As `context_of`.
+        context: As `TickContext.of`.
         numbers: (s,) place of each stream in the table; -1 = it is not there.
         due_us: (s,) next time of each stream [µs], updated.
         interval_us: (s,) its interval [µs]; 0 = off.
@@ -633,6 +637,6 @@ def payload(name: str, state: AutopilotState) -> bytes | None:
     """Return the payload of one of the messages, without trailing zeros; None = nothing to say."""
     number, once = np.array([NUMBERS[name]]), np.ones(1, np.int64)
     frames, _ = Packer().pack(
-        flown_of(state), 0, context_of(state), number, np.zeros(1, np.int64), once, 1, 0, 1
+        flown_of(state), 0, TickContext().of(state), number, np.zeros(1, np.int64), once, 1, 0, 1
     )
     return frames[0][10:-2] if frames else None

@@ -24,7 +24,7 @@ from firmware_sim.mavlink.link import Link, LinkConfig
 from firmware_sim.mavlink.services import commands, handle
 from firmware_sim.mavlink.services.context import Command, Context, for_vehicle, sender
 from firmware_sim.mavlink.streams import BUILDERS, Builder, status
-from firmware_sim.mavlink.telemetry import context_of, flown_of
+from firmware_sim.mavlink.telemetry import TickContext, flown_of
 from firmware_sim.mavlink.texts import TextEncoder
 from tests.support.ardupilot_copter import LAND, STABILIZE, Copter
 
@@ -81,7 +81,7 @@ class Manners:
             for message in link.receive():
                 self._take(message, link)
             due, state = link.scheduler.due(copter.time_us), copter.inner.state()
-            flown, context = flown_of(state), context_of(state)
+            flown, context = flown_of(state), TickContext().of(state)
             if not copter.position_ok:
                 flown["healthy"], context[:3] = 0, np.nan
             link.stream_fast(flown, copter.time_us - state.time_us, context, 16)
