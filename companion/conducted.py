@@ -15,6 +15,8 @@ class Poll(NamedTuple):
 
     every_us: int
     due: Due
+    by_heartbeat: bool = False
+    """Whether heartbeats alone tell of the condition."""
 
 
 class Sleep(Protocol):
@@ -55,11 +57,11 @@ class ConductedClock:
             if watchdog is not None and due_us is not None and self.time_us() >= due_us:
                 watchdog.look()
 
-    def poll(self, every_us: int, due: Due) -> None:
+    def poll(self, every_us: int, due: Due, by_heartbeat: bool) -> None:
         """Sleep for one interval [µs] or several, until a condition has to be checked."""
         wake_us = self.time_us() + every_us
         if self._watchdog is None:
-            self._sleep(wake_us, None, Poll(every_us, due))
+            self._sleep(wake_us, None, Poll(every_us, due, by_heartbeat))
         else:
             self.sleep_until(wake_us)
 

@@ -76,7 +76,7 @@ class MavsdkLink:
         clock: Clock,
         abandon: threading.Event | None = None,
         heard: Callable[[], bool] | None = None,
-        poll: Callable[[int, interfaces.Due], None] | None = None,
+        poll: Callable[[int, interfaces.Due, bool], None] | None = None,
     ) -> None:
         """Open a connection, as `open_connection`; `connect` waits for the vehicle.
 
@@ -409,7 +409,7 @@ class MavsdkLink:
         deadline_us = self._deadline(timeout_s)
         while self.armed:
             self._check(deadline_us, f"landing: still armed after {timeout_s:g} s")
-            self._pause_until(_disarmed, deadline_us)
+            self._pause_until(_disarmed, deadline_us, by_heartbeat=True)
 
     def _call(self, what: str, call: Any) -> None:
         try:
@@ -444,7 +444,12 @@ class MavsdkLink:
         self._clock.sleep_until(self._clock.time_us() + int(seconds * constants.US_PER_S))
 
     def _pause_until(
-        self, due: interfaces.Due, deadline_us: int, stop: threading.Event | None = None
+        self,
+        due: interfaces.Due,
+        deadline_us: int,
+        stop: threading.Event | None = None,
+        *,
+        by_heartbeat: bool = False,
     ) -> None:
         """Wait for one `POLL_S`, or for several if `due` tells that a condition still fails."""
         if self._poll is None:
@@ -453,6 +458,7 @@ class MavsdkLink:
             self._poll(
                 int(POLL_S * constants.US_PER_S),
                 lambda frames: due(frames) or self._over(deadline_us, stop=stop) is not None,
+                by_heartbeat,
             )
 
 

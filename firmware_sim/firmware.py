@@ -97,6 +97,10 @@ class FlightStack(Protocol):
         """Take what has arrived at simulated time `now_us` [µs]; return how much took effect."""
         ...
 
+    def next_send_us(self) -> float:
+        """Return the simulated time at which `send` is called next, at the latest [µs]."""
+        ...
+
     def send(self, now_us: int, flown: Record) -> None:
         """Send what is due.
 
@@ -139,7 +143,7 @@ class BuiltinFlightStack:
         self._save_us: int | None = None
         """When changed parameters are saved; None = there is nothing to save."""
         self.filenos = server.filenos
-        self.receive = server.receive
+        self.receive, self.next_send_us = server.receive, server.next_send_us
         self.send = server.send if keeper is None else self._send_and_save
         self.log_to = server.log_to
         self.counters = server.counters
@@ -329,8 +333,11 @@ class Firmware:
             self.on_log_lost(what)
 
     def _hear(self, message: Message) -> None:
-        if self._flight_log is not None and self.simulation is not None:
-            self._flight_log.text(message, self.simulation.time_us)
+        if self.simulation is not None:
+            now_us = self.simulation.time_us
+            self.clock.sleep_until(now_us)  # it stands while a stretch of ticks is flown
+            if self._flight_log is not None:
+                self._flight_log.text(message, now_us)
         if self.on_message is not None:
             self.on_message(message)
 
@@ -365,6 +372,8 @@ class Firmware:
         if camera is not None and camera.awaited:
             until_us = min(until_us, simulation.next_frame_us)
         log, internals = self._flight_log, simulation.autopilot.internals
+        if until_us > simulation.time_us:
+            until_us = min(until_us, flight_stack.next_send_us())
         simulation.advance(until_us, self._pacing.arrivals)
         if camera is not None and len(simulation.truths) > 1:
             simulation.capture_due(simulation.time_us - TICK_US, publish)

@@ -14,7 +14,7 @@ from airl_mav.arena.geometry import Arena
 from airl_mav.camera.frame import Frame
 from airl_mav.camera.render import Motion
 from airl_mav.core.clock import Clock
-from airl_mav.core.constants import TICK_US
+from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.streams import Stream, stream
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import Aircraft
@@ -24,7 +24,15 @@ from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.parameter_store import Keeper, Parameters
 from firmware_sim.engine.kinematics import POSITION, QUATERNION, RATES, VELOCITY
 from firmware_sim.engine.record import FLOWN_TICK, TRUE_TICK
-from firmware_sim.engine.ticks import ALIGN, COLLIDED, FUSE, log_flown_record, log_record
+from firmware_sim.engine.ticks import (
+    ALIGN,
+    COLLIDED,
+    EMPTY,
+    FUSE,
+    HEALTH,
+    log_flown_record,
+    log_record,
+)
 from firmware_sim.faults.camera import FailingCamera
 from firmware_sim.faults.controller import FailingParts
 from firmware_sim.faults.timeline import ClientFaults, FaultTimeline
@@ -38,14 +46,10 @@ from firmware_sim.plant.plant import Plant
 from firmware_sim.recording import FlightRecorder, fault_arrays
 from firmware_sim.simulation_snapshot import SimulationSnapshot
 
-STRETCH_US = 100_000
-"""A stretch of ticks ends at multiples of this simulated time after the first tick, if not before
-[µs]: streams at 10 Hz and below are sent in between."""
+MOST_TICKS = US_PER_S // TICK_US
+"""Maximum number of ticks that are flown at once."""
 
-MOST_TICKS = STRETCH_US // TICK_US
-
-
-_ENDS = (COLLIDED, ALIGN)
+_ENDS = (COLLIDED, ALIGN, HEALTH, EMPTY)
 """Events that end a stretch whatever follows from them."""
 
 
@@ -242,8 +246,7 @@ class Simulation:
             autopilot.take(self._sample)
             self._sample = None
         plant, done = self.plant, 0
-        until_us = min(until_us, self.time_us + STRETCH_US - (self.time_us - TICK_US) % STRETCH_US)
-        most = max(1, math.ceil((until_us - self.time_us) / TICK_US))
+        most = max(1, math.ceil(min((until_us - self.time_us) / TICK_US, MOST_TICKS)))
         arrives_us = math.inf if arrivals is None else arrivals.next_us
         while done < most:
             if done and arrivals is not None and arrives_us <= self.time_us:
@@ -255,8 +258,10 @@ class Simulation:
             ticks = max(1, math.ceil(min((due_us - self.time_us) / TICK_US, most - done)))
             flown, event = self._glide(autopilot, done, done + ticks)
             done += flown
-            self.time_us += flown * TICK_US
+            # Texts of a landing have the time of the tick in which it is detected.
+            self.time_us += (flown - 1) * TICK_US
             changed = autopilot.flown(plant.newest)
+            self.time_us += TICK_US
             # After what Python fuses, other aids may be in use.
             if changed or event in _ENDS or (event == FUSE and not autopilot.compiled):
                 break

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from airl_mav.core.clock import SimClock, WallClock
-from airl_mav.core.constants import US_PER_S
+from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.lockstep.digest import FlightDigest
 from airl_mav.lockstep.inbound import Inbound
 from airl_mav.lockstep.turns import Partner, Turn
@@ -23,6 +23,9 @@ from firmware_sim.flight_controller import FirmwareLostError
 FEED_US = US_PER_S
 """Telemetry is passed on when a turn begins, and after so long without one: MAVSDK gives a vehicle
 up after 3 s of wall time without a heartbeat [µs]."""
+
+SHOWN_US = US_PER_S // 10
+"""The vehicle flies no longer at once where somebody looks on [µs]."""
 
 SILENCE_US = 3 * US_PER_S
 """A flight controller that says nothing for longer is no longer heard, as MAVSDK has it [µs]."""
@@ -60,6 +63,10 @@ class Conductor:
         self._partner = partner
         self._digest = digest or FlightDigest()
         self._speed = speed
+        self.is_shown = speed is not None
+        """Whether somebody looks on."""
+        self.orders_us: Callable[[], float] = lambda: math.inf
+        """Returns when the companion may have an order by the passing of time [µs]."""
         self._wall: WallClock | None = None
         self._inbound = Inbound()
         self._turn = Turn(None)
@@ -101,8 +108,14 @@ class Conductor:
         turn = self._turn
         if self._suspended or self._asked is not None or turn.wake_us is None:
             return 0.0
-        interrupt = turn.interrupt
-        return 0.0 if interrupt is not None and interrupt.is_set() else turn.wake_us
+        if turn.interrupt is not None and turn.interrupt.is_set():
+            return 0.0
+        wake_us, poll = float(turn.wake_us), turn.poll
+        if poll is not None and poll.by_heartbeat and not poll.due(self._waiting):
+            wake_us = math.inf  # The vehicle stops flying with the tick of the next heartbeat.
+        if self.is_shown:
+            wake_us = min(wake_us, self.clock.time_us() + SHOWN_US)
+        return min(wake_us, self.orders_us())
 
     @property
     def arrivals(self) -> Conductor:
@@ -140,6 +153,7 @@ class Conductor:
         self._readable = readable
         if self._wall is not None:
             self._wall.sleep_until(tick_us)
+        self._pass_over_polls(tick_us)
         self._keep(self._vehicle.after_tick(expected=self._asked is not None))
         if self._suspended:
             self.clock.sleep_until(tick_us)
@@ -167,6 +181,16 @@ class Conductor:
                 self._deliver(self._inbound.repeat(first_us), readable)
         self.clock.sleep_until(tick_us)
         return tick_us
+
+    def _pass_over_polls(self, tick_us: int) -> None:
+        """Leave out the checks for a heartbeat before the newest tick began."""
+        wake_us, poll = self._turn.wake_us, self._turn.poll
+        if wake_us is None or poll is None or not poll.by_heartbeat:
+            return
+        missed_us = tick_us - TICK_US - wake_us
+        if missed_us >= 0:
+            wake_us += (missed_us // poll.every_us + 1) * poll.every_us
+            self._turn = replace(self._turn, wake_us=wake_us)
 
     def read_by(self, began_us: int) -> int:
         """Return `began_us`: time stands still while the vehicle reads."""
@@ -229,7 +253,7 @@ class Conductor:
         if not frames:
             return
         self._heard_us = self.clock.time_us()
-        self._digest.add("telemetry", self._heard_us, b"".join(frames))
+        self._digest.extend("telemetry", b"".join(frames))
         self._waiting += frames
         if self._asked is not None or self._heard_us - self._passed_us >= FEED_US:
             self._pass_telemetry()

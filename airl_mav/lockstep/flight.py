@@ -226,9 +226,11 @@ class Flight:
             if self._called_off:
                 self._abandon.set()
             self._stage.firmware.on_ticks = self._look
+            self._stage.conductor.orders_us = lambda: self._judge.due_us
             self._stage.firmware.on_message = self._hear
             if self._watched is not None:
                 self._stage.firmware.on_frame = self._watched.frame
+                self._stage.conductor.is_shown = True
             simulation = self._stage.run(
                 setup,
                 self._program,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -41,6 +42,11 @@ class Judge:
         self._order = order
         self._judged = judged
         self._crash = CrashDetector()
+
+    @property
+    def due_us(self) -> float:
+        """When the companion may have an order by the passing of time [µs]; inf = never."""
+        return math.inf if self._supervisor is None else self._supervisor.due_us
 
     @property
     def hit(self) -> str | None:

@@ -18,7 +18,6 @@ from firmware_sim.firmware import BuiltinFlightStack, FlightStack
 from firmware_sim.mavlink.endpoint import MemoryEndpoint, SharedEndpoint
 from firmware_sim.mavlink.link import LinkConfig, onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
-from firmware_sim.simulation import STRETCH_US
 
 BOOT_UNIX_US = 1_767_225_600 * US_PER_S
 """Calendar time of simulated time 0: 2026-01-01T00:00Z, whenever that is [µs since 1970]."""
@@ -28,6 +27,9 @@ MAVSDK_HZ = {"EXTENDED_SYS_STATE": 1.0}
 set from the start, and its request changes nothing (`inbound`)."""
 
 
+SLOW_EVERY_US = US_PER_S // 10
+"""Grid of the slow streams [µs]."""
+
 HEARTBEAT_US = US_PER_S
 """PX4 sends its heartbeat so often [µs]."""
 
@@ -36,11 +38,11 @@ def lockstep_link(endpoint: SharedEndpoint) -> LinkConfig:
     """Return the onboard link for a companion that is conducted.
 
     Answers have sequence numbers of their own: MAVSDK's requests come at any time, and must not
-    change the bytes of the streams. Slow streams are sent where every stretch of ticks ends.
+    change the bytes of the streams. The vehicle flies at once until slow streams are due.
     """
     link = onboard_link(endpoint)
     rates = {**link.rates_hz, **MAVSDK_HZ}
-    return replace(link, rates_hz=rates, separate_replies=True, slow_every_us=STRETCH_US)
+    return replace(link, rates_hz=rates, separate_replies=True, slow_every_us=SLOW_EVERY_US)
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable
 from contextlib import closing
@@ -73,6 +74,9 @@ class RemoteStage:
         self._conductor = Conductor(vehicle.end, self._partner, self._digest, asked.pace, clock)
         self.firmware = Firmware(vehicle.stack, camera, self._conductor, failing=vehicle.failing)
         self._judge = Judge(None, self._digest, order=self._partner.order)
+        self.end_us = math.inf
+        """When to end the flight at the latest [µs]."""
+        self._conductor.orders_us = lambda: min(self.end_us, self._judge.due_us)
 
     @property
     def ended(self) -> bool:
@@ -195,7 +199,8 @@ def _fly(
     Says how it went, and the fingerprint.
     """
     start_us, stopwatch = stage.time_us, WallClock()
-    while not stage.ended and not stop.is_set() and (end_us is None or stage.time_us < end_us):
+    stage.end_us = math.inf if end_us is None else end_us
+    while not stage.ended and not stop.is_set() and stage.time_us < stage.end_us:
         alone = stage.turns == 0
         stage.step()
         if alone:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from enum import Enum
 
 from airl_mav.core.constants import US_PER_S
@@ -38,6 +39,18 @@ class Supervisor:
     def verdict(self) -> Verdict | None:
         """The verdict, once there is one."""
         return self.referee.verdict
+
+    @property
+    def due_us(self) -> float:
+        """When an order is due by the passing of time [µs]; inf = none is."""
+        referee = self.referee
+        if self._called_off:
+            return math.inf
+        if referee.verdict is not None:
+            return referee.verdict.time_us + ARRIVAL_S * US_PER_S + 1.0
+        if referee.navigation_us is None:
+            return self.started_us + TAKEOFF_LIMIT_S * US_PER_S + 1.0
+        return referee.navigation_us + referee.task.time_limit_s * US_PER_S
 
     def see(self, sample: TruthSample) -> Order | None:
         """Take the next true sample; return what the companion must be told, if anything."""

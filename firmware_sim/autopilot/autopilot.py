@@ -118,6 +118,11 @@ class BuiltinAutopilot:
         """The commander's state and the setpoint that the newest decision is of."""
         self._decided_healthy = 0
         """Whether the estimator was healthy then, 0 or 1."""
+        self._told: tuple[object, ...] = ()
+        self._unsaid = 0
+        """What clients could see at the newest decision, and how many texts and events waited."""
+        self._has_news = False
+        """Whether a decision has changed that: the next tick is the last of its stretch."""
         self._navigated_on: tuple[object, ...] = ()
         """State, home, and numbers of changes of plans and parameters at the newest step."""
         self._newest = NewestSensors(record)
@@ -231,7 +236,19 @@ class BuiltinAutopilot:
         ):
             self.decide()
             self._prepare()
-        return self._due_us
+            self._has_news = self._look_for_news()
+        return self._taken_us if self._has_news else self._due_us
+
+    def _look_for_news(self) -> bool:
+        """Return whether clients are to be told of the newest decision."""
+        plans, waiting = self.plans, len(self._messages) + len(self._events)
+        told = (
+            *(self._commander.flight, self._guidance.destination, self._home.place),
+            *(self.estimator.origin, self.supervisor.changes, plans.current, plans.reached),
+        )
+        news = told != self._told or waiting > self._unsaid
+        self._told, self._unsaid = told, waiting
+        return news
 
     def _prepare(self) -> None:
         """Prepare the record for compiled ticks, and say when to decide again."""
@@ -270,7 +287,8 @@ class BuiltinAutopilot:
         if self.record["detected"].item(0):
             landed = before.phase is _AIR
             self._commander.handle(Event.LANDED if landed else Event.LIFTED)
-        return self._commander.flight is not before
+        news, self._has_news = self._has_news, False
+        return news or self._commander.flight is not before
 
     @property
     def _motors(self) -> Motors:
@@ -379,13 +397,14 @@ class BuiltinAutopilot:
 
     def take_messages(self) -> list[Message]:
         """Return texts for the operator since the last call."""
-        taken, self._messages = self._messages, []
+        taken, self._messages, self._unsaid = self._messages, [], 0
         return taken
 
     def take_events(self) -> list[Told]:
         """Return events since the last call."""
         taken = list(self._events)
         self._events.clear()
+        self._unsaid = 0
         return taken
 
     def tell_checks(self) -> None:
@@ -466,7 +485,7 @@ class BuiltinAutopilot:
     def set_home(self, place: Geodetic | None) -> Result:
         """Move home; None = to the present place."""
         done = self._home.set_here() if place is None else self._home.set_to(place)
-        self._snapshot = None
+        self._snapshot, self._due_us = None, 0
         return Result.ACCEPTED if done else Result.TEMPORARILY_REJECTED
 
     def set_origin(self, place: Geodetic) -> Result:
@@ -479,7 +498,7 @@ class BuiltinAutopilot:
             return Result.TEMPORARILY_REJECTED
         self.estimator.move_origin(place)
         self._home.find()
-        self._snapshot = None
+        self._snapshot, self._due_us = None, 0
         return Result.ACCEPTED
 
     def look_at(self, place: Geodetic | None) -> None:

@@ -71,11 +71,11 @@ from firmware_sim.engine.record import (
     Record,
 )
 
-NONE, NOISE, ROOM, FUSE, HEALTH, DETECTED, COLLIDED, ALIGN = 0, 1, 2, 3, 4, 5, 6, 7
+NONE, NOISE, ROOM, FUSE, HEALTH, DETECTED, COLLIDED, ALIGN, EMPTY = range(9)
 """Why `stretch` returned: all ticks are flown; a block of noise is used up; a contact is possible
 in the coming tick; Python has to fuse what the newest tick measured; the estimator has converged,
 or no longer is; the land detector has detected lift-off or landing; the vehicle has hit something
-(`Plant.touch`); the estimator may be aligned, or has its first fix."""
+(`Plant.touch`); the estimator may be aligned, or has its first fix; the battery is empty."""
 
 REPEATED_BITS = 3
 """`estimate` returns bits of `measured`; shifted by so many, which sensors repeated their last
@@ -721,7 +721,7 @@ def stretch(
             return k << EVENT_BITS | NOISE
         if not _is_clear(a) or (a.resting != 0 and a.held == 0):
             return k << EVENT_BITS | ROOM
-        row = flown[k]
+        row, charged = flown[k], a.charge > 0.0
         command(c, row)
         for i in range(4):
             row.battery[i] = a.battery[i]
@@ -745,4 +745,6 @@ def stretch(
             return (k + 1) << EVENT_BITS | HEALTH
         if c.detected != 0:
             return (k + 1) << EVENT_BITS | DETECTED
+        if charged and a.charge <= 0.0:
+            return (k + 1) << EVENT_BITS | EMPTY
     return ticks << EVENT_BITS | NONE

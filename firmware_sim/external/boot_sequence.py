@@ -120,6 +120,10 @@ class ExternalFlightStack:
         self.send = observer.send
         self.counters: Callable[[], dict[str, LinkCounters]] = observer.counters
 
+    def next_send_us(self) -> float:
+        """Return 0: its observer is called after every tick."""
+        return 0.0
+
     def receive(self, now_us: int) -> int:
         """Take what has come at simulated `now_us` [µs]; return how many messages counted."""
         if now_us < self._look_us:

@@ -77,6 +77,16 @@ class Client:
             or (events is not None and events.has_news(now_us))
         )
 
+    def next_us(self, now_us: int) -> float:
+        """Return when anything but fast streams is sent to it next, `now_us` = at any time [µs]."""
+        events, context, plan = self.events, self.context, self.link.scheduler
+        if self.late or self.link.pending or (context is not None and context.is_busy):
+            return now_us
+        slow_us = plan.next_slow_us(now_us)
+        if self.announced_origin is None:
+            slow_us = min(slow_us, plan.grid_us(now_us))
+        return slow_us if events is None else min(slow_us, events.next_us)
+
     def due(self, now_us: int) -> list[str]:
         """Return the streams to send now, at simulated time [µs]: first what is late."""
         due = self.link.scheduler.due(now_us)

@@ -78,7 +78,13 @@ class EventSender:
 
     def has_news(self, now_us: int) -> bool:
         """Return whether anything is to be sent at simulated `now_us` [µs]: mostly there is not."""
-        return self._sent != self._buffer.latest or now_us - self._announced_us > ANNOUNCED_US
+        return now_us >= self.next_us
+
+    @property
+    def next_us(self) -> int:
+        """When anything is sent next [µs]; 0 = now."""
+        news = self._sent != self._buffer.latest
+        return 0 if news else self._announced_us + ANNOUNCED_US + 1
 
     def due(self, now_us: int) -> Iterator[WireMessage]:
         """Yield what is to be sent at simulated `now_us` [µs]."""

@@ -258,7 +258,7 @@ class Link:
 
         `payloads` is what has been built from this tick's snapshot; gets what is built here.
         """
-        frames, encoder = self.pending, self._stream_encoder
+        frames, encoder, quiet = self.pending, self._stream_encoder, self.scheduler.quiet
         for name in names:
             shape, builder = self._streams[name]
             if builder in payloads:
@@ -267,9 +267,13 @@ class Link:
                 values = builder(state)
                 payload = None if values is None else _payload(shape, values)
                 payloads[builder] = payload
+            if payload is None:
+                quiet.add(name)
+                continue
+            quiet.discard(name)
             if payload:
                 frames.append(encoder.frame(shape, payload))
-            elif payload is not None:
+            else:
                 self._unsendable += 1
 
     def stream_fast(self, flown: Record, after_us: int, context: Vector, most: int) -> None:

@@ -59,6 +59,8 @@ class StreamScheduler:
         """When the next of the fast streams is due, or earlier [µs]."""
         self._next_us = 0
         """When the next of the others is due [µs]."""
+        self.quiet: set[str] = set()
+        """Slow streams that had nothing to send when they were due: no sensor, no radio."""
         self.wake_us = 0
         """The earlier of the two [µs]: before, there is nothing to do."""
         self._rebase_pending = False
@@ -97,6 +99,18 @@ class StreamScheduler:
         """Take simulated `now_us` [µs] for the time base, where that is asked for."""
         if self._rebase_pending:
             self._rebase(now_us)
+
+    def next_slow_us(self, now_us: int) -> float:
+        """Return when slow streams are sent next, at or after `now_us` [µs], but for quiet ones."""
+        if self._rebase_pending:
+            return now_us
+        names, quiet = self._names, self.quiet
+        due = [due_us for i, due_us in self._slow_due_us.items() if names[i] not in quiet]
+        return self.grid_us(max(now_us, min(due, default=_NEVER)))
+
+    def grid_us(self, time_us: int) -> int:
+        """Return the first time of the grid at or after another time [µs]."""
+        return TICK_US - (TICK_US - time_us) // self._every_us * self._every_us
 
     def is_time(self, now_us: int) -> bool:
         """Return whether slow streams may be sent at `now_us` [µs]."""

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import chain
 
 from airl_mav.core.clock import Clock
 from airl_mav.core.constants import TICK_US, US_PER_S
-from airl_mav.core.frames import Vector
 from airl_mav.core.signing import Signing, StoredSigning
 from firmware_sim.autopilot.autopilot_state import Message
 from firmware_sim.autopilot.port import AutopilotPort
@@ -171,6 +171,11 @@ class MavlinkServer:
             self._send_texts()
         return effective
 
+    def next_send_us(self) -> float:
+        """Return when `send` has to be called next [µs]: fast streams may wait until then."""
+        now_us = self._now_us + TICK_US
+        return min((client.next_us(now_us) for client in self._all()), default=math.inf)
+
     def send(self, now_us: int, flown: Record | None = None) -> None:
         """Send texts, pending parameters and the streams that are due at simulated `now_us` [µs].
 
@@ -223,16 +228,20 @@ class MavlinkServer:
         """
         assert self._port is not None  # noqa: S101 (the caller has looked)
         now_us, state = self._now_us, self._port.state()
-        origin = state.origin
-        context: Vector | None = None
+        origin, before, last = state.origin, self._context.row, len(flown) - 1
+        context = self._context.of(state)
         payloads: Payloads = {}
         most = max(1, STREAMS_PER_TICK // (2 * len(due)))
         share = _share([len(names) for _, names in due])
         for client, names in due:
             link = client.link
             if link.scheduler.fast_us <= now_us:
-                context = self._context.of(state) if context is None else context
-                link.stream_fast(flown, after_us, context, most)
+                if context is not before and last > 0:
+                    # A stretch of ticks ends with the first one after a change.
+                    link.stream_fast(flown[:last], after_us, before, most)
+                    link.stream_fast(flown[last:], after_us, context, most)
+                else:
+                    link.stream_fast(flown, after_us, context, most)
             if texts or (client.events is not None and client.events.has_news(now_us)):
                 _stream_news(client, texts, now_us)
             if len(names) > share:

@@ -31,6 +31,7 @@ from firmware_sim.engine.record import FLOWN_TICK, POSITION, TRAJECTORY, Fields,
 from firmware_sim.mavlink.codec import COMPONENT_ID, dialect, message_id
 from firmware_sim.mavlink.streams import units
 from firmware_sim.mavlink.streams.distance import clearance
+from firmware_sim.mavlink.streams.status import sensor_bits
 
 register_jitable(esc.current_a)
 
@@ -59,6 +60,8 @@ _SOURCES: Final = (
     *("esc_cdeg_1", "esc_cdeg_2", "esc_cdeg_3", "esc_cdeg_4"),
     *("rpm_1", "rpm_2", "rpm_3", "rpm_4", "volt"),
     *("ampere_1", "ampere_2", "ampere_3", "ampere_4"),
+    *("parts_present", "parts_enabled", "parts_healthy", "load", "parachute"),
+    *("battery_mv", "battery_ca", "battery_percent"),
 )
 _AT: Final = {name: place for place, name in enumerate(_SOURCES)}
 
@@ -106,6 +109,12 @@ FIELDS: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "SERVO_OUTPUT_RAW": (
             *("time_us", "zero", "pwm_1", "pwm_2", "pwm_3", "pwm_4"),
             *("pwm_off",) * 12,
+        ),
+        # Health bits, load [0.1 %], battery [mV], [10 mA], [%]; no communication errors.
+        "SYS_STATUS": (
+            *("parts_present", "parts_enabled", "parts_healthy", "load"),
+            *("battery_mv", "battery_ca", "battery_percent"),
+            *(*("zero",) * 8, "parachute"),
         ),
         "VFR_HUD": ("zero", "ground_speed", "heading_deg", "throttle", "hud_alt", "climb"),
         # Our own request.
@@ -221,7 +230,7 @@ _CRC = _crc_table()
 
 # What stays the same while compiled ticks are flown.
 _LATITUDE, _LONGITUDE, _ORIGIN_M, _HOME_M, _ARMED, _HOVER, _TERRAIN, _CLEARANCE = range(8)
-_GOAL, _FIX, _ESCS = 8, 11, 15
+_GOAL, _FIX, _ESCS, PARTS = 8, 11, 15, 19
 _UNKNOWN = (math.nan,) * 4
 
 
@@ -230,13 +239,15 @@ class TickContext:
 
     def __init__(self) -> None:
         self._values: tuple[float, ...] = ()
-        self._row = np.zeros(0)
+        self.row = np.zeros(0)
+        """The newest values."""
 
     def of(self, state: AutopilotState) -> Vector:
-        """Return the values (19,); NaN = not known.
+        """Return the values (23,); NaN = not known.
 
         Origin, height of home, arming, hover thrust, ground below, destination (local NED), type,
-        satellites and accuracies of the newest fix, outputs that the speed controllers report.
+        satellites and accuracies of the newest fix, outputs that the speed controllers report,
+        bits of SYS_STATUS, load.
         """
         origin, home, goal, fix = state.origin, state.home, state.destination, state.gps
         ground = state.clearance
@@ -249,10 +260,12 @@ class TickContext:
             *(_UNKNOWN[:3] if goal is None or origin is None else goal),
             *(_UNKNOWN if fix is None else (fix.fix_type, fix.satellites, fix.eph_m, fix.epv_m)),
             *(state.esc_outputs or _UNKNOWN),
+            *sensor_bits(state),
+            units.uint16(state.load * 1e3),
         )
         if values != self._values:
-            self._values, self._row = values, np.array(values, np.float64)
-        return self._row
+            self._values, self.row = values, np.array(values, np.float64)
+        return self.row
 
 
 def flown_of(state: AutopilotState) -> Record:
@@ -439,6 +452,17 @@ def _fix(v: Vector, row: Fields, context: Vector) -> None:
     v[_FIX_KNOWN + 9] = units.uint32(context[_FIX + 3] * 1e3)
 
 
+@kernel
+def _health(v: Vector, row: Fields, context: Vector) -> None:
+    """Write the health of the parts, and the battery."""
+    for i in range(4):
+        v[_PARTS_PRESENT + i] = context[PARTS + i]
+    v[_PARTS_PRESENT + 4] = _PARACHUTE
+    v[_BATTERY_MV] = units.uint16(row.battery[0] * 1e3)
+    v[_BATTERY_MV + 1] = units.int16(row.battery[1] * 100.0, -1)
+    v[_BATTERY_MV + 2] = units.saturate(row.battery[3] * 100.0, 0, 100, -1)
+
+
 @large_kernel
 def _sources(v: Vector, row: Fields, context: Vector) -> None:
     """Write the sources (len(_SOURCES),) of a tick's log."""
@@ -462,6 +486,7 @@ def _sources(v: Vector, row: Fields, context: Vector) -> None:
     _goal(v, context)
     _fix(v, row, context)
     _speed_controllers(v, row, context)
+    _health(v, row, context)
 
 
 (_ZERO, _NAN, _ONE, _HEALTHY, _LOCATED, _TIME_US, _ROLL, _QW, _P, _X, _VX, _VAR_X, _VAR_ROLL) = (
@@ -488,9 +513,14 @@ def _sources(v: Vector, row: Fields, context: Vector) -> None:
 (_SP_X, _SP_VX, _SP_AX, _SP_YAW, _PWM_1, _LOCAL_NED) = (
     _AT[name] for name in ("sp_x", "sp_vx", "sp_ax", "sp_yaw", "pwm_1", "local_ned")
 )
-(_GOAL_KNOWN, _FIX_KNOWN, _ESC_CDEG_1, _RPM_1, _VOLT, _AMPERE_1) = (
-    _AT[name] for name in ("goal_known", "fix_known", "esc_cdeg_1", "rpm_1", "volt", "ampere_1")
+(_GOAL_KNOWN, _FIX_KNOWN, _ESC_CDEG_1, _RPM_1, _VOLT, _AMPERE_1, _PARTS_PRESENT, _BATTERY_MV) = (
+    _AT[name]
+    for name in (
+        *("goal_known", "fix_known", "esc_cdeg_1", "rpm_1", "volt", "ampere_1", "parts_present"),
+        "battery_mv",
+    )
 )
+_PARACHUTE: int = dialect.MAV_SYS_STATUS_RECOVERY_SYSTEM
 _X_IGNORE: int = dialect.POSITION_TARGET_TYPEMASK_X_IGNORE
 _VX_IGNORE: int = dialect.POSITION_TARGET_TYPEMASK_VX_IGNORE
 _FRAME: int = dialect.MAV_FRAME_LOCAL_NED

@@ -336,7 +336,7 @@ def test_estimator_status() -> None:
 
 
 def healthy_sensors(state: AutopilotState) -> int:
-    return int(status.sys_status(state)[2])
+    return int(status.sensor_bits(state)[2])
 
 
 def estimator_flags(state: AutopilotState) -> int:

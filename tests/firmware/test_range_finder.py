@@ -449,12 +449,12 @@ def test_arming_waits_for_a_sensor_that_is_asked_for() -> None:
     rig.run(1.0)
     assert rig.ap.arm(force=False) is Result.TEMPORARILY_REJECTED
     assert not math.isnan(rig.said("Preflight Fail: Distance Sensor 0 missing"))
-    assert not status.sys_status(rig.ap.state())[0] & bit
+    assert not status.sensor_bits(rig.ap.state())[0] & bit
     reading = DistanceReading(0.3, 0.1, 12.0, quality=100)
     rig.run(0.5, lambda: rig.ap.measure_distance(reading))
-    assert all(field & bit for field in status.sys_status(rig.ap.state())[:3])
+    assert all(field & bit for field in status.sensor_bits(rig.ap.state()))
     rig.run(1.5)
-    present, enabled, healthy, *_ = status.sys_status(rig.ap.state())
+    present, enabled, healthy = status.sensor_bits(rig.ap.state())
     assert present & bit and enabled & bit and not healthy & bit
     assert rig.ap.arm(force=False) is Result.TEMPORARILY_REJECTED
     assert not math.isnan(rig.said("Preflight Fail: no valid data from distance sensor 0"))

@@ -24,7 +24,7 @@ from firmware_sim.mavlink.link import Link, LinkConfig
 from firmware_sim.mavlink.services import commands, handle
 from firmware_sim.mavlink.services.context import Command, Context, for_vehicle, sender
 from firmware_sim.mavlink.streams import BUILDERS, Builder, status
-from firmware_sim.mavlink.telemetry import TickContext, flown_of
+from firmware_sim.mavlink.telemetry import PARTS, TickContext, flown_of
 from firmware_sim.mavlink.texts import TextEncoder
 from tests.support.ardupilot_copter import LAND, STABILIZE, Copter
 
@@ -58,7 +58,6 @@ class Manners:
             **BUILDERS,
             "TIMESYNC": None,
             "HEARTBEAT": self._heartbeat,
-            "SYS_STATUS": self._sys_status,
             "EXTENDED_SYS_STATE": lambda state: (3, _LANDED[state.status.landed]),
             "AUTOPILOT_VERSION": _version,
         }
@@ -82,8 +81,12 @@ class Manners:
                 self._take(message, link)
             due, state = link.scheduler.due(copter.time_us), copter.inner.state()
             flown, context = flown_of(state), TickContext().of(state)
+            healthy = int(context[PARTS + 2])
             if not copter.position_ok:
                 flown["healthy"], context[:3] = 0, np.nan
+                context[PARTS + 2] = healthy & ~(_PREARM | _AHRS)
+            else:
+                context[PARTS + 2] = healthy | _PREARM | _AHRS
             link.stream_fast(flown, copter.time_us - state.time_us, context, 16)
             if due:
                 link.stream_due(due, state, {})
@@ -111,13 +114,6 @@ class Manners:
         base = 81 if copter.mode in (STABILIZE, LAND) else 89
         base |= 128 if copter.armed else 0
         return QUADROTOR, ARDUPILOTMEGA, base, copter.mode, 4 if copter.armed else 3, 3
-
-    def _sys_status(self, state: AutopilotState) -> Values:
-        present, enabled, health, *rest = status.sys_status(state)
-        health = int(health) & ~(_PREARM | _AHRS)
-        if self.copter.position_ok:
-            health |= _PREARM | _AHRS
-        return present, enabled, health, *rest
 
     def _report_ekf(self, link: Link) -> None:
         due_us, interval_us = self._ekf_us.get(link, (0, 0))

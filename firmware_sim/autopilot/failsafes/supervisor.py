@@ -72,6 +72,8 @@ class Supervisor:
         """When to look next: any earlier look does no harm."""
         self.conditions = Conditions()
         """What was wrong at the last look."""
+        self.changes = 0
+        """Number of looks at which conditions or readiness had changed."""
         self.failing: tuple[Check, ...] = ()
         """Pre-arm checks that failed at the last look."""
         self._ready: Readiness | None = None
@@ -132,6 +134,7 @@ class Supervisor:
             self._check_us, self._checked = now_us + CHECK_US, flight.phase
             readiness = self.readiness(sample, flight, flight.mode)
             if readiness != self._ready:
+                self.changes += 1
                 self._ready, self.failing = readiness, prearm.failing(readiness)
                 self._armable = not prearm.blocking(self.failing, readiness)
             self._reporter.update(readiness, now_us, force=self._asked)

@@ -80,6 +80,11 @@ class Context:
             or self.log_stream is not None
         )
 
+    @property
+    def is_busy(self) -> bool:
+        """Whether any service sends the client something piece by piece, or repeats it."""
+        return self.is_getting or self.transfer.is_running
+
     def announce_once(self, refusal: Message) -> None:
         """Announce why a message is refused, unless that was announced already."""
         if refusal.text not in self.refusals:

@@ -16,6 +16,8 @@ from firmware_sim.mavlink.codec import COMPONENT_ID, WireMessage, dialect
 from firmware_sim.mavlink.services import mission_items
 from firmware_sim.mavlink.services.context import ANY, Context, sender
 from firmware_sim.mavlink.services.transfers import (
+    REPEAT_US,
+    REPEATS,
     RETRY_US,
     TIMEOUT_US,
     Activity,
@@ -28,10 +30,6 @@ _PLANNERS = (COMPONENT_ID, ANY, dialect.MAV_COMP_ID_MISSIONPLANNER)
 ALL: int = dialect.MAV_MISSION_TYPE_ALL
 _ACCEPTED: int = dialect.MAV_MISSION_ACCEPTED
 _ERROR: int = dialect.MAV_MISSION_ERROR
-
-REPEATS = 10
-"""How often MISSION_ITEM_REACHED is sent again, each after REPEAT_US."""
-REPEAT_US = 1_000_000
 
 
 def is_addressed(message: WireMessage, context: Context) -> bool:

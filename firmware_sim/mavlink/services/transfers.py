@@ -272,6 +272,11 @@ class Activity(Enum):
     """A client uploads."""
 
 
+REPEATS = 10
+"""How often MISSION_ITEM_REACHED is sent again, each after REPEAT_US."""
+REPEAT_US = 1_000_000
+
+
 @dataclass(slots=True)
 class MissionTransfer:
     """The state of one link's transfers."""
@@ -301,6 +306,12 @@ class MissionTransfer:
     """Repetitions of the newest MISSION_ITEM_REACHED."""
     repeated_us: int = 0
     told_jumped: tuple[int, int] = (-1, 0)
+
+    @property
+    def is_running(self) -> bool:
+        """Whether messages are due by time: requests to the client, or repetitions."""
+        repeats = self.told_reached >= 0 and self.repeats < REPEATS
+        return self.activity is not Activity.IDLE or repeats
 
 
 # --- calibrations

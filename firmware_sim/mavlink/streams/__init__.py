@@ -47,7 +47,7 @@ BUILDERS: Mapping[str, Builder | None] = MappingProxyType(
         "VFR_HUD": None,
         "GPS_RAW_INT": None,
         "EXTENDED_SYS_STATE": status.extended_sys_state,
-        "SYS_STATUS": status.sys_status,
+        "SYS_STATUS": None,
         "ESTIMATOR_STATUS": status.estimator_status,
         "SCALED_PRESSURE": sensors.scaled_pressure,
         # PX4's simulator hands one measurement to two barometers.

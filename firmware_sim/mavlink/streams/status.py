@@ -9,7 +9,6 @@ from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Lande
 from firmware_sim.autopilot.mode_numbers import custom_mode
 from firmware_sim.mavlink.codec import Values, dialect
 from firmware_sim.mavlink.px4_custom_mode import base_mode, system_status
-from firmware_sim.mavlink.streams.sensors import percent
 from firmware_sim.mavlink.streams.units import boot_ms, int16, uint16
 
 CAPABILITIES: int = (
@@ -49,9 +48,6 @@ _NO_MISSION = 0xFFFF
 _UNKNOWN_STATE = 0
 """MISSION_CURRENT's mission_state and mission_mode: PX4 leaves them."""
 
-_NO_ERRORS = (0, 0, 0, 0, 0, 0)
-"""SYS_STATUS: drop rate, communication errors, errors 1..4."""
-
 _LANDED = {
     Landed.ON_GROUND: dialect.MAV_LANDED_STATE_ON_GROUND,
     Landed.IN_AIR: dialect.MAV_LANDED_STATE_IN_AIR,
@@ -85,7 +81,6 @@ _ALL_AUXILIARY = 0b1111_1100
 
 _RADIO = dialect.MAV_SYS_STATUS_SENSOR_RC_RECEIVER
 _RANGES = dialect.MAV_SYS_STATUS_SENSOR_LASER_POSITION
-_NONE_EXTENDED, _PARACHUTE = 0, dialect.MAV_SYS_STATUS_RECOVERY_SYSTEM
 
 
 def heartbeat(state: AutopilotState) -> Values:
@@ -120,8 +115,8 @@ def extended_sys_state(state: AutopilotState) -> Values:
     return dialect.MAV_VTOL_STATE_UNDEFINED, _LANDED[state.status.landed]
 
 
-def sys_status(state: AutopilotState) -> Values:
-    """Health bits, load [0.1 %], battery voltage [mV], current [10 mA] and charge [%].
+def sensor_bits(state: AutopilotState) -> tuple[int, int, int]:
+    """Return the bits of SYS_STATUS: present, enabled, healthy.
 
     Source: PX4 1.16, streams/SYS_STATUS.hpp: a part is enabled when it is present or unhealthy.
     """
@@ -141,18 +136,7 @@ def sys_status(state: AutopilotState) -> Values:
             unhealthy |= bit
     if _may_be_armed(state):
         healthy |= dialect.MAV_SYS_STATUS_PREARM_CHECK
-    battery = state.battery
-    return (
-        present,
-        present | unhealthy,
-        healthy,
-        uint16(state.load * 1e3),
-        uint16(battery.voltage_v * 1e3),
-        int16(battery.current_a * 100.0, unknown=-1),
-        percent(battery.remaining),
-        *_NO_ERRORS,
-        *(_NONE_EXTENDED, _NONE_EXTENDED, _PARACHUTE),
-    )
+    return present, present | unhealthy, healthy
 
 
 def _health(state: AutopilotState) -> Sequence[tuple[bool, int]]:
