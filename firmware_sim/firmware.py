@@ -335,7 +335,8 @@ class Firmware:
     def _hear(self, message: Message) -> None:
         if self.simulation is not None:
             now_us = self.simulation.time_us
-            self.clock.sleep_until(now_us)  # it stands while a stretch of ticks is flown
+            if self.simulation.is_flying:
+                self.clock.sleep_until(now_us)  # it stands while a stretch of ticks is flown
             if self._flight_log is not None:
                 self._flight_log.text(message, now_us)
         if self.on_message is not None:

@@ -158,6 +158,8 @@ class Simulation:
         self.start_us = start_us
         self.time_us = start_us
         """Simulated time of the newest sample."""
+        self.is_flying = False
+        """Whether `advance` is under way."""
         self._truths = np.zeros(MOST_TICKS, TRUE_TICK)
         self._flown = np.zeros(MOST_TICKS, FLOWN_TICK)
         self.truths = self._truths[:0]
@@ -207,7 +209,7 @@ class Simulation:
         between two of the ticks; None = nothing does.
         """
         plant, recorder, autopilot = self.plant, self.recorder, self.autopilot.internals
-        first_us = self._clock.time_us()
+        first_us, self.is_flying = self._clock.time_us(), True
         if recorder is None:
             plant.collisions.clear()
         else:
@@ -216,7 +218,7 @@ class Simulation:
             done = self._tick_by_python(autopilot)
         else:
             done = self._stretch(autopilot, until_us, arrivals)
-        self.time_us = plant.time_us
+        self.time_us, self.is_flying = plant.time_us, False
         self.truths = self._truths[:done]
         self.flown = self._flown[: 0 if autopilot is None else done]
         if recorder is not None:

@@ -154,6 +154,7 @@ class Conductor:
         if self._wall is not None:
             self._wall.sleep_until(tick_us)
         self._pass_over_polls(tick_us)
+        self.clock.sleep_until(tick_us - TICK_US)  # when the newest tick began
         self._keep(self._vehicle.after_tick(expected=self._asked is not None))
         if self._suspended:
             self.clock.sleep_until(tick_us)
