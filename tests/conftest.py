@@ -24,6 +24,14 @@ if find_spec("pybullet") is None:  # as on Python 3.12 and newer
     ]
     """They compare with pybullet."""
 
+RENDER_MESHES = {
+    "tests/firmware/test_ground_contacts.py",
+    "tests/learning/test_fleet_glass.py",
+    "tests/learning/test_fleet_meshes.py",
+    "tests/learning/test_fleet_terrain.py",
+}
+"""Modules for one worker: what they render with is compiled for half a minute, once."""
+
 # The first call of a kernel on a fresh machine compiles it: seconds, not a slow example.
 settings.register_profile("kernels", deadline=None)
 settings.register_profile("thorough", deadline=None, max_examples=3000)
@@ -55,7 +63,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         if group or item.get_closest_marker("slow") is not None:
             item.add_marker(pytest.mark.flaky(reruns=1))
         if not group:
-            item.add_marker(pytest.mark.xdist_group(item.nodeid.partition("::")[0]))
+            module = item.nodeid.partition("::")[0]
+            name = "meshes" if module in RENDER_MESHES else module
+            item.add_marker(pytest.mark.xdist_group(name))
     order = sorted(range(len(items)), key=lambda index: not named[index])
     items[:] = [items[index] for index in order]
 
@@ -76,6 +86,18 @@ def _operators_are_read_once() -> Iterator[None]:
         patch.setattr(
             ONNXRegistry, "from_torchlib", staticmethod(cache(ONNXRegistry.from_torchlib))
         )
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _one_worker_unless_asked() -> Iterator[None]:
+    """Let experiments in this process have one worker where a test asks for no number.
+
+    Each is a process that imports all and loads the kernels, for seconds; the tests keep the cores
+    busy without them.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("airl_mav.experiments.process_executor.usable_cores", lambda: 1)
         yield
 
 

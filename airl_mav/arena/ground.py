@@ -58,17 +58,15 @@ class Ground:
     def relief(self) -> Relief:
         """The ground as kernels take it."""
         step_n, step_e = self.step_north, self.step_east
-        rise_n, rise_e = (
-            np.diff(self.heights, axis=0) / step_n,
-            np.diff(self.heights, axis=1) / step_e,
-        )
+        rise_n = np.diff(self.heights, axis=0) / step_n
+        rise_e = np.diff(self.heights, axis=1) / step_e
         # Of the triangle north-west of a cell's diagonal, and of that south-east of it.
         steepest = max(
             float(np.hypot(rise_n[:, :-1], rise_e[1:]).max()),
             float(np.hypot(rise_n[:, 1:], rise_e[:-1]).max()),
         )
         grid = [self.south, self.west, step_n, step_e, self.top_m, steepest, *self.heights.shape]
-        return Relief(self.heights.ravel(), np.array(grid))
+        return Relief(self.heights.flatten(), np.array(grid))
 
     @property
     def top_m(self) -> float:

@@ -70,9 +70,9 @@ def read_options(model: type[Options], prog: str, words: Sequence[str]) -> Optio
         words = words[1:]
         held = read_scenario_file(file)
         validated(model, held, file)
-    parsed = tyro.cli(
-        _arguments(model, held), prog=prog, description=inspect.getdoc(model), args=words
-    )
+    # There are no comments: it would read this file's source for each table.
+    kind: Any = Annotated[(_arguments(model, held), tyro.conf.HelptextFromCommentsOff)]
+    parsed = tyro.cli(kind, prog=prog, description=inspect.getdoc(model), args=words)
     try:
         return validated(model, dataclasses.asdict(parsed))
     except FieldError as error:

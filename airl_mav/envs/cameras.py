@@ -250,6 +250,8 @@ class Cameras(Stateful):
         The noise is drawn from the episodes' `seeds` (n,).
         """
         frames = self._frames(fleet.time_us)
+        # One type for kernels, whoever asks: they are compiled once.
+        fleet = Seen(*(getattr(fleet, name) for name in Seen._fields))
         for eyes in (self._main, *self.further.values()):
             eyes.take(fleet, arenas, who, seeds, frames)
         for each in self._changed:

@@ -147,7 +147,12 @@ def test_one_process_serves_one_episode_after_the_other(process: CameraProcess) 
     the_same_in_place(fly(camera, 40_000, lambda seen: len(seen) == 2), 40_000)
 
 
-@pytest.mark.parametrize("which", [COLOUR, FISHEYE], ids=["pinhole", "fisheye"])
+@pytest.mark.parametrize(
+    "which",
+    # In every run test_mitsuba.py traces fisheyes in its own process.
+    [COLOUR, pytest.param(FISHEYE, marks=pytest.mark.nightly)],
+    ids=["pinhole", "fisheye"],
+)
 def test_path_traced_images_are_those_of_lockstep(which: Camera, process: CameraProcess) -> None:
     pytest.importorskip("mitsuba")
     camera = process.camera(which, arena(), 0, None, 3, "mitsuba")

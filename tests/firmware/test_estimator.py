@@ -364,10 +364,10 @@ def wander(rig: Rig, seconds: float, seed: int) -> Log:
             v -= [0.05, 0.05, 0.3] * (rig.truth.position - [0, 0, -8])
             rig.stream(velocity_setpoint(*v, yaw=rng.uniform(-3.1, 3.1)))
         rig.tick()
-        truth = rig.truth
-        biases = rig.sim.plant.record["gyro_bias"][0], rig.sim.plant.record["accel_bias"][0]
         if tick % 50:
             continue
+        truth = rig.truth
+        biases = rig.sim.plant.record["gyro_bias"][0], rig.sim.plant.record["accel_bias"][0]
         e = rig.ap.state().estimate
         assert e.time_us == truth.time_us
         assert estimator.origin is not None

@@ -34,9 +34,10 @@ def count(rig: Rig, text: str) -> int:
 
 
 def until_said(rig: Rig, text: str, limit_s: float) -> float:
-    """Fly until a text is said once more; return the time [s] that took."""
-    before = count(rig, text)
-    return rig.until(lambda: count(rig, text) > before, limit_s)
+    """Fly until a text is said once more; return the time [s] until then."""
+    began_s, before = rig.time_s, count(rig, text)
+    rig.until(lambda: count(rig, text) > before, limit_s)
+    return rig.said(text) - began_s
 
 
 def until_disarmed(rig: Rig, limit_s: float) -> float:
@@ -274,8 +275,10 @@ def test_disarms_after_landing(wait_s: float) -> None:
 def test_disarms_without_take_off(wait_s: float) -> None:
     with flight(SEED, parameters={"COM_DISARM_PRFLT": wait_s}) as rig:
         rig.arm()
-        assert until_disarmed(rig, 15.0) == pytest.approx(wait_s, abs=0.02)
-        assert count(rig, "Disarmed by auto preflight disarming") == 1
+        text = "Disarmed by auto preflight disarming"
+        assert until_said(rig, text, 15.0) == pytest.approx(wait_s, abs=0.02)
+        assert rig.ap.flight.phase is Phase.STANDBY
+        assert count(rig, text) == 1
 
 
 def test_disarming_times_can_be_switched_off() -> None:

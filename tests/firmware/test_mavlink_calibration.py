@@ -79,7 +79,7 @@ def test_what_needs_the_vehicle_turned_waits_until_it_is_cancelled(
 ) -> None:
     rig = Rig()
     assert calibrate(rig, number, 1) == ACCEPTED
-    assert texts(rig, 60.0)[0] == f"[cal] calibration started: 2 {sensor}"
+    assert texts(rig, 20.0)[0] == f"[cal] calibration started: 2 {sensor}"
     assert calibrate(rig, 1, 1) == REJECTED
     assert calibrate(rig) == ACCEPTED
     assert texts(rig, 10.0) == [

@@ -39,7 +39,7 @@ def still_answers(bench: Bench, link: str) -> None:
 
 
 @pytest.mark.parametrize("link", LINKS)
-@settings(max_examples=60, deadline=None, derandomize=True)
+@settings(max_examples=30, deadline=None, derandomize=True)
 @given(chunks=st.lists(st.binary(min_size=1, max_size=400), min_size=1, max_size=20))
 def test_random_bytes(link: str, chunks: list[bytes]) -> None:
     bench = Bench()
@@ -92,7 +92,7 @@ def aimed(body: bytes, kind: Any) -> bytes:
 
 @pytest.mark.parametrize("link", LINKS)
 @settings(
-    max_examples=100, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
+    max_examples=50, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
 )
 @given(sent=st.lists(frames(), min_size=1, max_size=20))
 def test_valid_frames_with_senseless_contents(link: str, sent: list[bytes]) -> None:
@@ -105,7 +105,7 @@ def test_valid_frames_with_senseless_contents(link: str, sent: list[bytes]) -> N
     still_answers(bench, link)
 
 
-@settings(max_examples=200, deadline=None, derandomize=True)
+@settings(max_examples=100, deadline=None, derandomize=True)
 @given(name=st.sampled_from(HANDLED), body=st.binary(min_size=255, max_size=255))
 def test_senseless_contents_addressed_to_us(name: str, body: bytes) -> None:
     kind = getattr(dialect, f"MAVLink_{name}_message")
@@ -136,7 +136,7 @@ def _repack(kind: Any, raw: bytes, mav: Any) -> bytes:
 
 
 @pytest.mark.parametrize("link", LINKS)
-@settings(max_examples=100, deadline=None, derandomize=True)
+@settings(max_examples=50, deadline=None, derandomize=True)
 @given(
     sent=st.lists(frames(), min_size=1, max_size=10),
     mutate=st.lists(

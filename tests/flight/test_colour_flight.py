@@ -15,7 +15,6 @@ from airl_mav.core.errors import FieldError, UsageError
 from airl_mav.envs.arenas import batch_of
 from airl_mav.envs.colour_images import ColourImages, Looks
 from airl_mav.envs.encoding import COMPILED
-from airl_mav.envs.fleet import new_fleet
 from airl_mav.envs.meshes import MeshesSeen
 from airl_mav.lockstep.flight import fly
 from airl_mav.policy.card import load_card
@@ -26,6 +25,7 @@ from airl_mav.scenario.resolved import ResolvedScenario
 from firmware_sim.plant.camera_server import SimulatedCamera
 from tests.support.command_line import airl
 from tests.support.lockstep_kit import demo_scenario
+from tests.support.poses import at_rest
 from tests.support.trained_here import Watching, trained
 
 SEED = 3
@@ -108,7 +108,7 @@ def test_the_companion_gets_the_images_that_the_twin_renders(
     looks = Looks(1)
     looks.put(0, arena)
     twin = ColourImages(Intrinsics.of(camera), Mount.of(camera), looks, MeshesSeen(1))
-    fleet, arenas, image = new_fleet(1), batch_of([arena]), np.zeros((1, 48, 64, 3), np.uint8)
+    fleet, arenas, image = at_rest(1), batch_of([arena]), np.zeros((1, 48, 64, 3), np.uint8)
     spec = learned.card.observation
     for each, capture_us in zip(seen, captures.tolist(), strict=True):
         fleet.position[0], fleet.quaternion[0], frame = taken[capture_us]

@@ -87,6 +87,7 @@ def test_own_acceleration(tmp_path: Path) -> None:
     assert len(times_s) == 3, text
 
 
+@pytest.mark.nightly  # In every run its policy flies in test_body_rates.py, in time and late.
 def test_own_body_rates(tmp_path: Path) -> None:
     """They need decisions in time, where velocities would hardly lose anything."""
     text = output_of("own_body_rates.py", tmp_path)

@@ -15,7 +15,7 @@ from airl_mav.envs.cameras import Eye, render_images
 from airl_mav.envs.colour_images import lens_of
 from airl_mav.envs.encoding import COMPILED
 from airl_mav.envs.evaluation import SinglePilots, fly_seeds
-from airl_mav.envs.fleet import Verdict, new_fleet
+from airl_mav.envs.fleet import Verdict
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.spec import spec_of
 from airl_mav.lockstep.flight import fly
@@ -27,6 +27,7 @@ from airl_mav.policy.observation import Observation
 from airl_mav.policy.observation_spec import MOST_FRAMES, ObservationSpec
 from firmware_sim.plant.camera_server import SimulatedCamera
 from tests.support.lockstep_kit import demo_scenario
+from tests.support.poses import at_rest
 
 SEED = 3
 
@@ -65,7 +66,7 @@ def test_the_companion_gets_the_images_that_the_twin_renders(
     assert all(each.intrinsics == lens for each in seen)
     arena = scenario.arena_of(SEED)
     mount = Mount((camera.forward_m, 0.0, -camera.up_m), math.radians(camera.pitch_up_deg))
-    fleet, arenas = new_fleet(1), batch_of([arena])
+    fleet, arenas = at_rest(1), batch_of([arena])
     twin = np.zeros((1, camera.height_px, camera.width_px), np.uint16)
     for each, capture_us in zip(seen, captures.tolist(), strict=True):
         fleet.position[0], fleet.quaternion[0] = poses[capture_us]

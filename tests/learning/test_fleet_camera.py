@@ -16,11 +16,12 @@ from airl_mav.core.frames import quat_from_euler
 from airl_mav.envs.arenas import batch_of
 from airl_mav.envs.cameras import Eye, render_images
 from airl_mav.envs.colour_images import Lens, lens_of
-from airl_mav.envs.fleet import Fleet, new_fleet
+from airl_mav.envs.fleet import Seen
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import load_vehicle
 from tests.support.lenses import OPENING
+from tests.support.poses import at_rest
 
 N = 12
 CAMERA = Intrinsics.from_fov(64, 48, math.radians(87.0))
@@ -36,9 +37,9 @@ def worlds(request: pytest.FixtureRequest) -> list[Arena]:
     return [generate(spec, seed, name="view", vehicle_width_m=0.55) for seed in range(N)]
 
 
-def scattered(rng: np.random.Generator) -> Fleet:
+def scattered(rng: np.random.Generator) -> Seen:
     """Vehicles anywhere in the room, tilted, at any time."""
-    fleet = new_fleet(N)
+    fleet = at_rest(N)
     fleet.position[:] = rng.uniform([-20, -20, -4.5], [20, 20, -0.5], (N, 3))
     for i in range(N):
         roll, pitch = rng.normal(0.0, 0.3, 2)
@@ -48,7 +49,7 @@ def scattered(rng: np.random.Generator) -> Fleet:
 
 
 def expected(
-    world: Arena, fleet: Fleet, i: int, range_m: float, camera: Intrinsics = CAMERA
+    world: Arena, fleet: Seen, i: int, range_m: float, camera: Intrinsics = CAMERA
 ) -> np.ndarray:
     pose = camera_pose(fleet.position[i], fleet.quaternion[i], MOUNT)
     centers = world.centers_at(int(fleet.time_us[i]))
@@ -87,7 +88,7 @@ def test_only_those_that_look_get_an_image(worlds: list[Arena]) -> None:
 def test_obstacles_are_seen_where_they_are_at_the_vehicle_s_time() -> None:
     spec = load_profile("arenas", "dynamic-obstacles", ArenaSpec)
     world = generate(spec, 3, name="view", vehicle_width_m=0.55)
-    fleet, arenas, out = new_fleet(1), batch_of([world]), np.zeros((1, 48, 64), np.uint16)
+    fleet, arenas, out = at_rest(1), batch_of([world]), np.zeros((1, 48, 64), np.uint16)
     fleet.position[0, 2] = -2.0
     seen = []
     for time_us in (0, 1_500_000, 0, 90_000_000):
@@ -106,7 +107,7 @@ def test_depth_beyond_16_bits_is_clipped() -> None:
     """A wall 90 m ahead: 65,535 mm, as in a frame of the rehearsal."""
     spec = load_profile("arenas", "no-obstacles", ArenaSpec)
     world = generate(spec, 1, name="view", vehicle_width_m=0.55)
-    fleet, arenas = new_fleet(1), batch_of([world])
+    fleet, arenas = at_rest(1), batch_of([world])
     arenas.bounds[0] = [-100.0, 100.0, -100.0, 100.0, 50.0, 0.0]
     fleet.position[0] = [0.0, 0.0, -20.0]
     out = np.zeros((1, 9, 9), np.uint16)

@@ -19,12 +19,13 @@ from airl_mav.core.frames import quat_from_euler
 from airl_mav.envs.arenas import batch_of
 from airl_mav.envs.cameras import Eye, render_images
 from airl_mav.envs.colour_images import ColourImages, Looks, lens_of
-from airl_mav.envs.fleet import Fleet, new_fleet
+from airl_mav.envs.fleet import Seen
 from airl_mav.envs.meshes import MeshesSeen
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from tests.support.command_line import airl
 from tests.support.lenses import BARREL
+from tests.support.poses import at_rest
 
 MOUNT = Mount((0.1, 0.0, 0.02), 0.1)
 CAMERA = Intrinsics.from_fov(48, 32, 1.5)
@@ -64,9 +65,9 @@ def seen_of(worlds: list[Arena]) -> MeshesSeen:
     return seen
 
 
-def scattered(n: int) -> Fleet:
+def scattered(n: int) -> Seen:
     rng = np.random.default_rng(4)
-    fleet = new_fleet(n)
+    fleet = at_rest(n)
     fleet.position[:] = rng.uniform([0, -15, -4.0], [30, 15, -0.5], (n, 3))
     for i in range(n):
         roll, pitch = rng.normal(0.0, 0.2, 2)
@@ -86,7 +87,12 @@ def test_the_worlds_have_meshes_of_both_kinds(worlds: list[Arena]) -> None:
 
 
 @pytest.mark.timeout(600)  # compiles kernels, on a busy machine for minutes
-@pytest.mark.parametrize("camera", [CAMERA, FISHEYE], ids=["pinhole", "fisheye"])
+# Without meshes, test_fleet_camera.py has the twin's fisheye.
+@pytest.mark.parametrize(
+    "camera",
+    [CAMERA, pytest.param(FISHEYE, marks=pytest.mark.nightly)],
+    ids=["pinhole", "fisheye"],
+)
 def test_depth_is_bit_for_bit_that_of_the_rehearsal(
     worlds: list[Arena], camera: Intrinsics
 ) -> None:

@@ -20,7 +20,7 @@ from airl_mav.envs.arenas import batch_of, put_arena, relief_of, with_room
 from airl_mav.envs.cameras import Eye, render_images
 from airl_mav.envs.colour_images import ColourImages, Looks, lens_of
 from airl_mav.envs.experts import Expert
-from airl_mav.envs.fleet import Fleet, Verdict, new_fleet
+from airl_mav.envs.fleet import Seen, Verdict
 from airl_mav.envs.meshes import MeshesSeen
 from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.planner import OVER_M, Body, map_of
@@ -28,6 +28,7 @@ from airl_mav.envs.spec import EnvironmentSpec
 from airl_mav.policy.action_sets import commands
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
+from tests.support.poses import at_rest
 
 MOUNT = Mount((0.1, 0.0, 0.02), 0.1)
 CAMERA = Intrinsics.from_fov(48, 32, 1.5)
@@ -49,9 +50,9 @@ def worlds() -> list[Arena]:
     ]
 
 
-def scattered(n: int, seed: int) -> Fleet:
+def scattered(n: int, seed: int) -> Seen:
     rng = np.random.default_rng(seed)
-    fleet = new_fleet(n)
+    fleet = at_rest(n)
     fleet.position[:] = rng.uniform([0, -14, -6.0], [30, 14, -0.5], (n, 3))
     for i in range(n):
         roll, pitch = rng.normal(0.0, 0.2, 2)
@@ -59,7 +60,7 @@ def scattered(n: int, seed: int) -> Fleet:
     return fleet
 
 
-def images(worlds: list[Arena], seen: MeshesSeen, fleet: Fleet) -> np.ndarray:
+def images(worlds: list[Arena], seen: MeshesSeen, fleet: Seen) -> np.ndarray:
     n = len(worlds)
     out = np.zeros((n, CAMERA.height, CAMERA.width), np.uint16)
     lens = lens_of(CAMERA, RANGE_M)
@@ -67,7 +68,7 @@ def images(worlds: list[Arena], seen: MeshesSeen, fleet: Fleet) -> np.ndarray:
     return out
 
 
-def own(world: Arena, fleet: Fleet, i: int) -> np.ndarray:
+def own(world: Arena, fleet: Seen, i: int) -> np.ndarray:
     pose = camera_pose(fleet.position[i], fleet.quaternion[i], MOUNT)
     return depth_to_z16(render(world, world.centers_at(0), CAMERA, RANGE_M, *pose))
 

@@ -6,15 +6,16 @@ for an answer, fast while the vehicle flies.
 
 from __future__ import annotations
 
+import math
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from mavsdk import ComponentType, Configuration, Mavsdk
 
 from airl_mav.core.clock import SimClock
-from airl_mav.core.constants import TICK_S
+from airl_mav.core.constants import TICK_S, US_PER_S
 from airl_mav.scenario.aircraft import Aircraft
 from firmware_sim.mavlink.link import LinkConfig
 from firmware_sim.mavlink.rates import ONBOARD_HZ
@@ -29,6 +30,10 @@ SLOW = 2.0
 MOST_HZ = 10.0
 """Of any stream: at the speed of the tests they would cost more than the flight."""
 
+AHEAD_S = 1.0
+"""So far simulated time may be ahead of what a test that waits has seen: on a busy machine a test
+that looked up late would else find the vehicle minutes later, landed by a failsafe."""
+
 _TURN_S = 0.01
 """So long is the pause between two bursts of ticks [wall s]."""
 
@@ -40,15 +45,25 @@ class Flown:
         self.companion = companion
         self.simulation = simulation
         self.speed = SLOW
+        self._until_s = math.inf
+
+    @property
+    def waits(self) -> bool:
+        """Whether simulated time has to wait for the test."""
+        return self.simulation.time_us > self._until_s * US_PER_S
 
     @contextmanager
-    def at(self, speed: float) -> Iterator[None]:
-        """Let simulated time run at a speed meanwhile."""
+    def at(self, speed: float) -> Iterator[Callable[[float], None]]:
+        """Let simulated time run at a speed meanwhile; what is yielded takes the time seen [s]."""
         before, self.speed = self.speed, speed
+        self._see(self.simulation.time_us / US_PER_S)
         try:
-            yield
+            yield self._see
         finally:
-            self.speed = before
+            self.speed, self._until_s = before, math.inf
+
+    def _see(self, now_s: float) -> None:
+        self._until_s = now_s + AHEAD_S
 
 
 class _Thread:
@@ -84,6 +99,8 @@ class _Thread:
             while not self._stop.is_set():
                 speed = SLOW if self.flown is None else self.flown.speed
                 for _ in range(max(1, round(speed * _TURN_S / TICK_S))):
+                    if self.flown is not None and self.flown.waits:
+                        break
                     self.server.receive(self.simulation.time_us)
                     self.simulation.tick()
                     self.server.send(self.simulation.time_us)

@@ -35,12 +35,12 @@ FAST, OFFBOARD = 16.0, 4.0
 """How fast a wait may run [simulated s a wall s]; MAVSDK repeats setpoints by the wall clock."""
 
 Plugin = TypeVar("Plugin")
-Pace = Callable[[float], AbstractContextManager[None]]
-"""Lets simulated time run at a speed meanwhile, where that can be chosen."""
+Pace = Callable[[float], AbstractContextManager[Callable[[float], None]]]
+"""Lets simulated time run at a speed meanwhile, where that can be chosen; is told what was seen."""
 
 
-def _as_it_is(_speed: float) -> AbstractContextManager[None]:
-    return nullcontext()
+def _as_it_is(_speed: float) -> AbstractContextManager[Callable[[float], None]]:
+    return nullcontext(lambda _now_s: None)
 
 
 class RefusedError(Exception):
@@ -149,11 +149,12 @@ class Vehicle:
     def _ticks(self, speed: float) -> Any:
         """Yield the simulated time whenever it has moved. RefusedError: it stands still."""
         before, deadline = 0.0, time.monotonic() + _STANDS_STILL_S
-        with self._pace(speed):
+        with self._pace(speed) as seen:
             while True:
                 now = self.now_s
                 if now != before:
                     before, deadline = now, time.monotonic() + _STANDS_STILL_S
+                    seen(now)
                     yield now
                 elif time.monotonic() > deadline:
                     raise RefusedError("simulated time stands still")
