@@ -16,7 +16,7 @@ class Poll(NamedTuple):
     every_us: int
     due: Due
     by_heartbeat: bool = False
-    """Whether heartbeats alone tell of the condition."""
+    """Whether heartbeats alone change the condition."""
 
 
 class Sleep(Protocol):

@@ -56,7 +56,7 @@ class MissionResult:
     """goal reached, stopped, link lost, camera silent, watchdog, the limit that was broken
     (`limits.py`), or what was refused or failed."""
     notes: tuple[str, ...]
-    """What the watchdog did, which limit was broken and how, what went wrong on the way down."""
+    """Actions of the watchdog, the broken limit, failures during the landing."""
     log: DecisionLog
 
 
@@ -121,7 +121,7 @@ def fly_mission(
     elif reason == "watchdog" and watchdog.culprit == WAITING:
         reason = CAMERA_SILENT
     if navigating and not (watchdog.left_offboard or abandon.is_set()):
-        # Whatever ended it, somebody may have taken over meanwhile.
+        # A pilot may have taken over meanwhile.
         limits.not_ours(link.status(), clock.time_us())
     notes = list(watchdog.notes)
     if limits.ending is not None:

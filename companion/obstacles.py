@@ -42,7 +42,7 @@ SENSOR_TYPE_UNKNOWN, FRAME_BODY_FRD = 4, 12
 
 
 class Vehicle(Sender, Protocol):
-    """What tells how the vehicle is tilted, and sends messages; `MavsdkLink` is one."""
+    """Attitude of the vehicle, and a way to send messages; `MavsdkLink` is one."""
 
     def kinematics(self) -> Kinematics:
         """Return the newest position, velocity and attitude."""

@@ -42,7 +42,7 @@ OLDEST_FRAME_US = US_PER_S
 """A frame that claims to be older, or from the future, is stamped by another clock [µs]."""
 
 WAITING = "waiting for a frame"
-"""What the pilot tells the watchdog that it is at."""
+"""Stage of a decision, for the watchdog."""
 
 
 class Decided(NamedTuple):
@@ -60,7 +60,7 @@ class Decided(NamedTuple):
     expires_us: int | None
     """When the velocity is zeroed unless another decision has come; None: never."""
     image: NDArray[Any]
-    """What the policy saw, as `Frame.image`; compensated where that is asked."""
+    """Image that the policy received, as `Frame.image`, compensated if asked."""
 
 
 @dataclass

@@ -22,10 +22,10 @@ LEAST_PX: Final = 320
 """A picture is enlarged by a whole factor until it is at least so wide, each pixel a square."""
 
 DARKEST: Final = 32.0
-"""Grey of what is as far as a depth camera sees, of 255: more than of what has no return."""
+"""Grey value of the maximum range, 0 to 255; pixels without a return are darker."""
 
 KEYFRAME_S: Final = 1.0
-"""Whoever begins to watch sees a picture after this time at most [s]."""
+"""A new viewer gets a picture within this time [s]."""
 
 CRF: Final = 23
 """Quality of x264, its own default: 0 has no loss, 51 is the worst."""

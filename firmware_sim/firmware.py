@@ -195,7 +195,7 @@ class Loaded:
 
 
 class Firmware:
-    """Flies one episode after the other; its links and its camera stay open."""
+    """Flies one episode after the other. Its links and its camera stay open."""
 
     def __init__(
         self,
@@ -243,15 +243,10 @@ class Firmware:
         """Where frames are published; "" without a camera."""
         return self._camera.endpoint if self._camera is not None else ""
 
-    @property
-    def epoch_ns(self) -> int | None:
-        """Host monotonic time of simulated time 0 [ns]; None when time is not paced."""
-        return self._pacing.epoch_ns
-
-    @property
-    def slipped_us(self) -> int:
-        """Simulated time given up since the start because the host could not keep up [µs]."""
-        return self._pacing.slipped_us
+    epoch_ns = property(lambda self: self._pacing.epoch_ns)
+    """Host monotonic time of simulated time 0 [ns]; None when time is not paced."""
+    slipped_us = property(lambda self: self._pacing.slipped_us)
+    """Simulated time given up since the start because the host could not keep up [µs]."""
 
     def load(self, setup: EpisodeSetup, tlog: Path | None, start_unix_us: int) -> Loaded:
         """Replace the episode: a new arena, the vehicle at rest, the autopilot booting.
@@ -392,7 +387,7 @@ class Firmware:
             self._camera.publish(frame)
 
     def save(self, path: Path) -> None:
-        """Write the episode's arrays and close its logs; the flight goes on unrecorded."""
+        """Write the episode's arrays and close its logs. The flight goes on unrecorded."""
         if self.simulation is not None:
             strangers = np.array(self.flight_stack.strangers(), np.str_)
             save_arrays(path, {**self.simulation.arrays(), "commands/strangers": strangers})

@@ -65,7 +65,7 @@ class Odometry(NamedTuple):
 
 
 class DistanceReading(NamedTuple):
-    """One range of a distance sensor; the fields are those of PX4's distance_sensor."""
+    """One range of a distance sensor. The fields are those of PX4's distance_sensor."""
 
     distance_m: float
     least_m: float

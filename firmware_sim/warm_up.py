@@ -22,11 +22,11 @@ from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import DEFAULT_PLANT, Aircraft, PlantName
 from firmware_sim.autopilot.error_state import INITIAL_SIGMA, new_state
 from firmware_sim.autopilot.filter_kernel import KernelFilter
-from firmware_sim.autopilot.land_detector import LandDetector
 from firmware_sim.autopilot.range_finder import Aids, RangeFinder
 from firmware_sim.autopilot.terrain_filter import TerrainFilter
 from firmware_sim.autopilot.yaw_estimator import YawEstimator
 from firmware_sim.engine.controller import Controller
+from firmware_sim.engine.ticks import detect_record
 from firmware_sim.interfaces import DistanceReading
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from firmware_sim.mavlink.link import gcs_link, onboard_link
@@ -103,7 +103,7 @@ def _fly(vehicle: VehicleProfile, plant: PlantName, arena: Arena | None) -> None
         simulation.close()
     _fly_every_kind(autopilot.parameters.value)
     _fuse_in_the_air()
-    _detect_ground(autopilot.parameters.value)
+    detect_record(autopilot.record)
     _measure_the_ground(autopilot.parameters.value)
 
 
@@ -123,13 +123,6 @@ def _fuse_in_the_air() -> None:
     estimator = YawEstimator()
     estimator.feel(np.zeros(3), HOVER)
     estimator.observe(np.zeros(3), 0.5, np.zeros(3), flying=True)
-
-
-def _detect_ground(value: Callable[[str], float]) -> None:
-    """Ask the land detector: compiled ticks do without its Python."""
-    detector, state = LandDetector(value), new_state()
-    detector.landed(state, 0, 0.0, descending=True)
-    detector.lifted(state, 0.0)
 
 
 def _measure_the_ground(value: Callable[[str], float]) -> None:

@@ -12,13 +12,7 @@ from numpy.typing import NDArray
 
 from airl_mav.core.fields import ArrayField
 from airl_mav.core.streams import Stream, stream
-from airl_mav.profiles.appearance import (
-    Appearance,
-    Material,
-    SurfaceName,
-    Surfaces,
-    TextureName,
-)
+from airl_mav.profiles.appearance import Appearance, Material, SurfaceName, Surfaces, TextureName
 from airl_mav.profiles.asset_files import ImageFile
 
 Floats = NDArray[np.float64]

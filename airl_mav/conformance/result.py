@@ -49,7 +49,7 @@ class Settings:
 
 @dataclass
 class ConformanceResult:
-    """What a run found, as far as it came."""
+    """Results of a run, complete or not."""
 
     settings: Settings
     checks: list[Check] = field(default_factory=list)

@@ -44,11 +44,7 @@ from airl_mav.control.memory import (
     weight,
 )
 from airl_mav.control.mixer import Motors, mix
-from airl_mav.control.velocity import (
-    acceleration_control,
-    velocity_control,
-    velocity_setpoint,
-)
+from airl_mav.control.velocity import acceleration_control, velocity_control, velocity_setpoint
 from airl_mav.core.kernels import kernel
 from airl_mav.vehicle.rotation import Quat, Vec
 

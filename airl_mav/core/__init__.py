@@ -1,1 +1,1 @@
-"""What everything else stands on: time, units, frames, files, errors, the machine."""
+"""Basics for every package: time, units, frames, files, errors, the machine."""

@@ -98,10 +98,8 @@ class ChildProcess:
         self.stdout = self._process.stdout
         """The pipe that it writes to; None where that is not captured."""
 
-    @property
-    def pid(self) -> int:
-        """Process id."""
-        return self._process.pid
+    pid = property(lambda self: self._process.pid)
+    """Process id."""
 
     def poll(self) -> Exited | None:
         """Return how it ended; None while it runs."""

@@ -27,7 +27,7 @@ _PACKAGES = ("airl_mav", "firmware_sim")
 """Those of the distribution that hold kernels."""
 
 _ROOT = Path(__file__).resolve().parents[2]
-"""Where they lie."""
+"""Folder of the packages."""
 
 _CACHE_NAME = "numba-"
 """How the name of a folder of compiled code begins; the digest of its sources follows."""

@@ -23,13 +23,7 @@ from airl_mav.envs.navigation import Navigation
 from airl_mav.envs.planner import Planner
 from airl_mav.envs.saved_state import State, Stateful
 from airl_mav.envs.spec import ExpertName
-from airl_mav.policy.action_sets import (
-    VELOCITIES,
-    VERTICAL,
-    ActionSpec,
-    commands,
-    discrete_actions,
-)
+from airl_mav.policy.action_sets import VELOCITIES, VERTICAL, ActionSpec, commands, discrete_actions
 from airl_mav.policy.actions import fastest_climb
 from airl_mav.policy.greedy import GreedyPolicy, GreedySettings
 

@@ -5,10 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
-from pydantic import (
-    Field,
-    model_validator,
-)
+from pydantic import Field, model_validator
 
 from airl_mav.core.errors import FieldError, UnexpectedArgumentError, UsageError
 from airl_mav.core.fields import Each, ProfileModel, later_field, quantity, validated

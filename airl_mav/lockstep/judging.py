@@ -48,10 +48,8 @@ class Judge:
         """When the companion may have an order by the passing of time [µs]; inf = never."""
         return math.inf if self._supervisor is None else self._supervisor.due_us
 
-    @property
-    def hit(self) -> str | None:
-        """What has been hit so far."""
-        return self._crash.hit
+    hit = property(lambda self: self._crash.hit)
+    """What has been hit so far."""
 
     def enter(self, phase: str, time_us: int) -> None:
         """The companion has entered a phase, at a simulated time [µs]."""

@@ -93,10 +93,8 @@ class TokenPartner:
         self._phases: set[str] = set()
         """Told in this turn."""
 
-    @property
-    def turns(self) -> int:
-        """Turns given so far."""
-        return self._number
+    turns = property(lambda self: self._number)
+    """Turns given so far."""
 
     def order(self, order: Order) -> None:
         """Tell the companion what to do, in its next turn."""

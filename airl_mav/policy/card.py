@@ -22,11 +22,7 @@ from airl_mav.policy.action_sets import CONTINUOUS, ActionSpec
 from airl_mav.policy.action_sets import SHIPPED as SHIPPED_ACTION_SETS
 from airl_mav.policy.actions import DecisionTiming
 from airl_mav.policy.observation_spec import SHIPPED as SHIPPED_LAYOUTS
-from airl_mav.policy.observation_spec import (
-    ObservationSpec,
-    camera_mismatch,
-    further_mismatch,
-)
+from airl_mav.policy.observation_spec import ObservationSpec, camera_mismatch, further_mismatch
 from airl_mav.policy.runtime import OnnxRuntime
 from airl_mav.profiles.camera import Camera
 

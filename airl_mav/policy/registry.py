@@ -44,7 +44,7 @@ class PolicyInfo:
     program: str | None = None
     """FILE.py:CLASS or MODULE:CLASS of one that is written in Python."""
     asked: CommandKind | None = None
-    """What it commands, of one that is never loaded: somebody else is asked for its decisions."""
+    """Command kind of a policy that another program runs."""
 
     @property
     def sha256(self) -> str | None:

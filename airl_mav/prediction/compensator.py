@@ -25,12 +25,7 @@ from numpy.typing import NDArray
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.constants import GRAVITY_M_S2, US_PER_MS, US_PER_S
 from airl_mav.core.errors import FieldError
-from airl_mav.core.frames import (
-    Vector,
-    quat_from_euler,
-    quat_to_matrix,
-    quats_to_euler,
-)
+from airl_mav.core.frames import Vector, quat_from_euler, quat_to_matrix, quats_to_euler
 from airl_mav.policy.observation import Kinematics
 from airl_mav.prediction.memory import DecisionMemory
 from airl_mav.prediction.reprojection import CameraPose, Reprojector, Sight
@@ -276,7 +271,7 @@ class Compensator:
 
 
 class _Mount:
-    """Where a camera sits on its vehicle."""
+    """Place of a camera on its vehicle."""
 
     def __init__(self, camera: Camera) -> None:
         self._offset = np.array([camera.forward_m, camera.right_m, -camera.up_m])

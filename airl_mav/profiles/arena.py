@@ -63,7 +63,7 @@ class Start(ProfileModel):
 
 
 class Goal(ProfileModel):
-    """Where to fly: drawn anew with every seed, or fixed by `north_m` and `east_m`."""
+    """The goal: drawn anew with every seed, or fixed by `north_m` and `east_m`."""
 
     north_m: float | None = quantity(
         "fixed goal: north of the start; left out: drawn", "m", ge=-500, le=500, default=None

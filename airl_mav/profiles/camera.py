@@ -12,12 +12,7 @@ from airl_mav.core.constants import US_PER_MS, US_PER_S
 from airl_mav.core.errors import FieldError
 from airl_mav.core.fields import Each, ProfileModel, later_field, quantity
 from airl_mav.profiles.camera_kind import CYLINDER_MOST_DEG, CameraKind, Projection, check_fov
-from airl_mav.profiles.distortion import (
-    MOST_COEFFICIENT,
-    UNDISTORTED,
-    Distortion,
-    check_distortion,
-)
+from airl_mav.profiles.distortion import MOST_COEFFICIENT, UNDISTORTED, Distortion, check_distortion
 from airl_mav.profiles.imaging import Imaging
 
 LEAST_ROWS = 6

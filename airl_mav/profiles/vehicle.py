@@ -4,11 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import (
-    Field,
-    Strict,
-    model_validator,
-)
+from pydantic import Field, Strict, model_validator
 
 from airl_mav.core.constants import C_PER_MAH, GRAVITY_M_S2
 from airl_mav.core.errors import FieldError, UsageError

@@ -12,12 +12,7 @@ import numpy as np
 
 from airl_mav.core.clock import WallClock, utc_now
 from airl_mav.core.constants import US_PER_MS, US_PER_S
-from airl_mav.core.machine import (
-    MachineState,
-    machine_state,
-    mean_frequency_mhz,
-    temperature_c,
-)
+from airl_mav.core.machine import MachineState, machine_state, mean_frequency_mhz, temperature_c
 from airl_mav.core.power import PowerMeter, PowerSampling, PowerSource, find_power_source
 from airl_mav.core.progress import Bar, Progress
 from airl_mav.core.provenance import describe_machine

@@ -16,13 +16,7 @@ from airl_mav.core.errors import UsageError
 from airl_mav.core.fields import validated
 from airl_mav.core.files import replace_file, write_json
 from airl_mav.policy.registry import find_policy
-from airl_mav.profiles.computer import (
-    ComputerProfile,
-    Latency,
-    Network,
-    Workload,
-    write_samples,
-)
+from airl_mav.profiles.computer import ComputerProfile, Latency, Network, Workload, write_samples
 from airl_mav.profiles.parameters import SPECS, parameter_values
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.refitting.air import Air

@@ -43,7 +43,7 @@ class Begin(_Line):
     type: Literal["begin"] = "begin"
     scenario: ResolvedScenario
     log: str | None = None
-    """What real firmware prints goes to this file."""
+    """File for the output of real firmware."""
     view: ViewEnds | None = None
     """Where the flights are watched; None: nowhere."""
 

@@ -28,7 +28,7 @@ from airl_mav.scenario.file import SCENARIO_FILE, save_scenario
 from airl_mav.scenario.model import free_fields
 
 if TYPE_CHECKING:
-    # Whoever reads a run needs nothing of what resolves a scenario.
+    # Reading a run needs no resolved scenario.
     from airl_mav.scenario.resolved import ResolvedScenario
 
 SCHEMA = 1

@@ -29,12 +29,7 @@ from airl_mav.report.measures import RunSummary, rate_digits, summarize_run
 from airl_mav.report.run_figures import latency_figure
 from airl_mav.report.run_tables import ages_table, estimation_table, faults_table, run_ages
 from airl_mav.report.scene import ALL_FLIGHTS, plotly_script
-from airl_mav.report.shown_flights import (
-    ShownFlights,
-    page_data,
-    pictured_flights,
-    shown_flights,
-)
+from airl_mav.report.shown_flights import ShownFlights, page_data, pictured_flights, shown_flights
 from airl_mav.report.table import OUTCOME_LABELS, ms
 from airl_mav.report.theme import montage
 from airl_mav.report.timeline import (

@@ -13,14 +13,7 @@ from airl_mav.core.files import Arrays
 from airl_mav.core.frames import ned_to_heading, quat_multiply, quats_to_euler
 from airl_mav.flight.record import EpisodeRecord
 from airl_mav.flight.trajectory import Trajectory
-from airl_mav.latency.stamps import (
-    ATTITUDE,
-    NO_STAMP,
-    RATES,
-    SETPOINT,
-    commanded,
-    setpoint_column,
-)
+from airl_mav.latency.stamps import ATTITUDE, NO_STAMP, RATES, SETPOINT, commanded, setpoint_column
 from airl_mav.rehearsal.run_folder import LoadedRun
 from airl_mav.report.forensics.worst import flown_path
 

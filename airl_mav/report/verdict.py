@@ -53,7 +53,7 @@ class OverallVerdict:
     """What a run, or a comparison, has come to."""
 
     sentences: tuple[str, ...]
-    """What flew, on what, and what came of it, with intervals: one for a run."""
+    """Policy, machine and outcome of a run, with intervals."""
     short: str
     """The same in few words, for a badge."""
     invalid: tuple[str, ...] = ()

@@ -81,10 +81,8 @@ class ResolvedScenario:
     watchdog: WatchdogSettings
     """Bounds on silence, with what the policy's card says of hovering."""
 
-    @property
-    def seeds(self) -> tuple[int, ...]:
-        """Seed of each episode, by index."""
-        return self.scenario.seeds
+    seeds = property(lambda self: self.scenario.seeds)
+    """Seed of each episode, by index."""
 
     def left(self, done: Iterable[EpisodeRecord] = ()) -> list[PlannedEpisode]:
         """Return what is left to be flown when some episodes are done."""

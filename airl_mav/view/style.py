@@ -1,4 +1,4 @@
-"""What things look like in a scene, whoever draws it."""
+"""Colours and shapes of a scene, for every renderer."""
 
 from __future__ import annotations
 

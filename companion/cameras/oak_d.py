@@ -59,17 +59,13 @@ class OakD:
             first = self._taken(FAILED_S)
             if first is None:
                 raise ValueError(f"no image for {FAILED_S:g} s")
-            self._lens = _lens_of(first)
+            self.lens = _lens_of(first)
+            """Lens of the rectified images, by the calibration that the device holds."""
             _checked(first)
         except (RuntimeError, ValueError) as error:
             self.close()
             raise FieldError("camera", name, problem=" ".join(str(error).split())) from None
         self._first: Any | None = first
-
-    @property
-    def lens(self) -> Lens:
-        """Return the lens of the rectified images, by the calibration that the device holds."""
-        return self._lens
 
     def read(self, timeout_s: float) -> DepthImage | None:
         """Wait for the next image; RuntimeError after 5 s or disconnection, else ValueError."""

@@ -33,16 +33,12 @@ class RealSense:
         self._device, self._utc_now_us = device, utc_now_us
         self._sensor, profile = _depth_stream(device)
         k = profile.as_video_stream_profile().intrinsics
-        self._lens = Lens(k.width, k.height, k.fx, k.fy, k.ppx, k.ppy)
+        self.lens = Lens(k.width, k.height, k.fx, k.fy, k.ppx, k.ppy)
+        """Lens of the depth stream, which librealsense delivers rectified."""
         self._queue = rs.frame_queue(1)
         self._silence = Silence()
         self._sensor.open(profile)
         self._sensor.start(self._queue)
-
-    @property
-    def lens(self) -> Lens:
-        """Return the lens of the depth stream, which librealsense delivers rectified."""
-        return self._lens
 
     def read(self, timeout_s: float) -> DepthImage | None:
         """Wait for the next image; RuntimeError after 5 s: unplugged, or a recording is over."""

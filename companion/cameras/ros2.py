@@ -24,7 +24,6 @@ from rosbags.typesys import Stores, get_typestore
 from airl_mav.core.clock import utc_us
 from airl_mav.core.errors import FieldError, UsageError
 from companion.cameras.driver import DepthImage, Silence
-from companion.cameras.fitting import Lens
 from companion.cameras.ros_images import CAMERA_INFO, IMAGE, age_us, depth_mm, info_topic, lens_of
 
 DESCRIBED_S = 5.0
@@ -144,7 +143,8 @@ class Ros2Camera:
                 f" (ROS_DOMAIN_ID {_domain()})",
             )
         try:
-            self._lens = lens_of(info, topic)
+            self.lens = lens_of(info, topic)
+            """Lens that camera_info described at first."""
         except ValueError as error:
             raise FieldError("camera", name, problem=f"{described}: {error}") from None
         self._images = self._reader(topic, Image)
@@ -153,11 +153,6 @@ class Ros2Camera:
         return DataReader(
             self._participant, Topic(self._participant, f"rt{topic}", kind), qos=NEWEST
         )
-
-    @property
-    def lens(self) -> Lens:
-        """Return the lens that camera_info described at first."""
-        return self._lens
 
     def read(self, timeout_s: float) -> DepthImage | None:
         """Wait for the next image; RuntimeError after 5 s, ValueError without depth."""

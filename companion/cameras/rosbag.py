@@ -37,7 +37,8 @@ class RosBag:
         self._first_us: int | None = None
         try:
             self._topic = self._chosen(name, path, f"/{topic}" if separator else None)
-            self._lens = self._described(name)
+            self.lens = self._described(name)
+            """Lens that camera_info described at first."""
         except FieldError:
             self._bag.close()
             raise
@@ -82,11 +83,6 @@ class RosBag:
         which = [each for each in self._bag.connections if each.topic == topic]
         for connection, time_ns, data in self._bag.messages(connections=which):
             yield time_ns // NS_PER_US, self._bag.deserialize(data, connection.msgtype)
-
-    @property
-    def lens(self) -> Lens:
-        """Return the lens that camera_info described at first."""
-        return self._lens
 
     def read(self, timeout_s: float) -> DepthImage | None:
         """Wait until the next image is due; RuntimeError at the end, ValueError without depth."""

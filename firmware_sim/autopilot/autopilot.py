@@ -58,7 +58,7 @@ from firmware_sim.autopilot.requests import (
 from firmware_sim.autopilot.snapshot import Parts, Snapshot
 from firmware_sim.engine.controller import Controller
 from firmware_sim.engine.record import LANDING, LIFT_OFF, NOTHING
-from firmware_sim.engine.ticks import REPEATED_BITS, control_record
+from firmware_sim.engine.ticks import REPEATED_BITS, control_record, detect_record
 from firmware_sim.interfaces import (
     ActuatorControls,
     DistanceReading,
@@ -167,7 +167,8 @@ class BuiltinAutopilot:
         self.decide_if_due()
         if self._demand is not None:
             control_record(self.record)
-        self._detect_ground(sample.time_us)
+        if detect_record(self.record):
+            self._handle_detected()
         return ActuatorControls(
             sample.time_us, self._motors, self._commander.flight.phase >= _GROUND
         )
@@ -183,7 +184,8 @@ class BuiltinAutopilot:
         self._newest.take(sample)
         finder = self.estimator.range
         if finder is not None:
-            self._guidance.context.ground = self._land_detector.ground = finder.clearance()
+            self._guidance.context.ground = ground = finder.clearance()
+            self._land_detector.see(ground)
         if sample.esc_outputs is not None:
             self.supervisor.watch.hear_escs(sample.time_us, self._motors, sample.esc_outputs)
 
@@ -285,8 +287,7 @@ class BuiltinAutopilot:
         if not self.record["aligned"].item(0):
             self._due_us = 0
         if self.record["detected"].item(0):
-            landed = before.phase is _AIR
-            self._commander.handle(Event.LANDED if landed else Event.LIFTED)
+            self._handle_detected()
         news, self._has_news = self._has_news, False
         return news or self._commander.flight is not before
 
@@ -318,16 +319,9 @@ class BuiltinAutopilot:
     def _situation(self) -> Situation | None:
         return self._whereabouts.situation(landed=self._commander.flight.phase is not _AIR)
 
-    def _detect_ground(self, time_us: int) -> None:
-        phase = self._commander.flight.phase
-        if phase is _AIR:
-            control = self._controller
-            if self._land_detector.landed(
-                self._state, time_us, control.thrust, descending=control.descending
-            ):
-                self._commander.handle(Event.LANDED)
-        elif phase is _GROUND and self._land_detector.lifted(self._state, self._controller.thrust):
-            self._commander.handle(Event.LIFTED)
+    def _handle_detected(self) -> None:
+        landed = self._commander.flight.phase is _AIR
+        self._commander.handle(Event.LANDED if landed else Event.LIFTED)
 
     # --- texts
 

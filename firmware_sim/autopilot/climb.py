@@ -28,7 +28,7 @@ def approach_speed(distance_m: float, limits: ClimbLimits) -> float:
 
 
 class Climb:
-    """A vertical trajectory towards a height; its speed changes no faster than its limits."""
+    """A vertical trajectory towards a height. Its speed changes no faster than its limits."""
 
     def __init__(self) -> None:
         self.height_m = 0.0

@@ -61,9 +61,7 @@ class FlightCommander:
         self.armed_us = self.takeoff_us = 0
         """When it was armed and took off; 0 while it is disarmed."""
 
-    @property
-    def _now_us(self) -> int:
-        return self._newest.time_us
+    _now_us = property(lambda self: self._newest.time_us)
 
     def look(self) -> None:
         """Let the failsafes look, and do what they decide."""

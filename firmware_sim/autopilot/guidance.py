@@ -1,4 +1,4 @@
-"""Turns the mode into a demand for the cascade; what each mode flies stands in `modes`."""
+"""Turns the mode into a demand for the cascade. What each mode flies stands in `modes`."""
 
 from __future__ import annotations
 

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Vector
@@ -30,15 +31,15 @@ UNSURE = 3.0
 
 
 # Layout of the thresholds.
-_TRIGGER_US, _CARRIED_THRUST, _SLOW_DOWN, _SLOW, _LIFT_THRUST, _LIFTED_M_S = range(6)
+_TRIGGER_US, _CARRIED_THRUST, _SLOW_DOWN, _SLOW, _LIFT_THRUST, _LIFTED_M_S, _NEAR = range(7)
 
 
 def thresholds(value: Callable[[str], float]) -> Vector:
-    """Return what the parameters say (6,).
+    """Return the thresholds by the parameters (7,).
 
     LNDMC_TRIG_TIME [µs]; the thrust below which the floor must be carrying; vertical and horizontal
     speed of a vehicle at rest [m/s]; thrust of one that flies; vertical speed of one that has left
-    the floor at any thrust [m/s].
+    the floor at any thrust [m/s]; 1 = near the ground as far as is known.
     """
     low, hover, vertical = value("MPC_THR_MIN"), value("MPC_THR_HOVER"), value("LNDMC_Z_VEL_MAX")
     return np.array(
@@ -49,6 +50,7 @@ def thresholds(value: Callable[[str], float]) -> Vector:
             value("LNDMC_XY_VEL_MAX"),
             LIFT_THRUST * hover,
             LIFTED_SPEED * vertical,
+            1.0,
         ]
     )
 
@@ -61,6 +63,7 @@ def rests(state: Vector, thrust: float, land: Vector) -> bool:
         thrust <= land[_CARRIED_THRUST]
         and slow
         and math.hypot(state[V], state[V + 1]) < land[_SLOW]
+        and land[_NEAR] != 0.0
     )
 
 
@@ -76,57 +79,31 @@ def lifts_off(state: Vector, thrust: float, land: Vector) -> bool:
 
 
 class LandDetector:
-    """Detects a landing after LNDMC_TRIG_TIME without motion at low thrust."""
+    """Keeps the thresholds of a flight controller's record; compiled ticks detect."""
 
-    def __init__(self, value: Callable[[str], float], record: Any = None) -> None:
-        """Take a lookup of PX4 parameter names.
-
-        `record` is that of the flight controller; None = a new one.
-        """
-        if record is None:
-            from firmware_sim.engine.record import new_controller
-
-            record = new_controller()
-        self._value = value
-        self._record = record
-        self.read_parameters()
-        self.ground: Clearance | None = None
-        """How far the ground is below; None = nothing tells it."""
+    def __init__(self, value: Callable[[str], float], record: NDArray[Any]) -> None:
+        """Take a lookup of PX4 parameter names and the record of a flight controller."""
+        self._value, self._record = value, record
+        self._ground: Clearance | None = None
         self._ground_seen = False
         """Whether ranges have ever told the ground."""
-
-    def landed(self, state: Vector, time_us: int, thrust: float, *, descending: bool) -> bool:
-        """Return whether a flying vehicle has come to stand.
-
-        `thrust` is the collective that is commanded, 0..1. `descending`: the setpoint asks to go
-        down; a low-thrust moment in level flight is no landing.
-        """
-        ground, record = self.ground, self._record
-        if ground is not None and ground.by_range:
-            self._ground_seen = True
-        if not (descending and rests(state, thrust, self._land) and self._is_near_ground()):
-            record["still_since_us"] = -1
-            return False
-        if record["still_since_us"][0] < 0:
-            record["still_since_us"] = time_us
-        needed_us = self._land[_TRIGGER_US]
-        if self._ground_seen and self.ground is not None and not self.ground.valid:
-            needed_us *= UNSURE
-        return bool(time_us - record["still_since_us"][0] >= needed_us)
-
-    def lifted(self, state: Vector, thrust: float) -> bool:
-        """Return whether a standing vehicle has left the floor."""
-        self._record["still_since_us"] = -1
-        return bool(lifts_off(state, thrust, self._land))
-
-    def _is_near_ground(self) -> bool:
-        """Return whether ranges allow that the vehicle stands; without any they do."""
-        ground = self.ground
-        if ground is None:
-            return True
-        return not (self._ground_seen and ground.valid and ground.dist_bottom_m >= NEAR_GROUND_M)
+        self.read_parameters()
 
     def read_parameters(self) -> None:
         """Read the parameters anew."""
         self._record["land"] = thresholds(self._value)
-        self._land = self._record["land"][0]
+        self.see(self._ground)
+
+    def see(self, ground: Clearance | None) -> None:
+        """Take how far the ground is below; None = nothing tells it.
+
+        A vehicle stands only where ranges allow it; without any they do.
+        """
+        land, self._ground = self._record["land"][0], ground
+        if ground is None:
+            return
+        self._ground_seen = self._ground_seen or ground.by_range
+        far = ground.valid and ground.dist_bottom_m >= NEAR_GROUND_M
+        unsure = UNSURE if self._ground_seen and not ground.valid else 1.0
+        land[_TRIGGER_US] = self._value("LNDMC_TRIG_TIME") * US_PER_S * unsure
+        land[_NEAR] = not (self._ground_seen and far)

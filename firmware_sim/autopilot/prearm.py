@@ -79,7 +79,7 @@ def _charge_required(r: Readiness) -> bool:
 
 
 def _battery_level(r: Readiness) -> BatteryWarning:
-    """Return the warning; a charge below COM_ARM_BAT_MIN counts as low at least."""
+    """Return the warning. A charge below COM_ARM_BAT_MIN counts as low at least."""
     warning = r.conditions.battery_warning
     if _charge_required(r) and r.charge_short:
         return max(warning, BatteryWarning.LOW)

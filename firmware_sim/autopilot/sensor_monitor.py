@@ -30,7 +30,6 @@ from firmware_sim.interfaces import SensorSample
 NO_DATA_US = US_PER_S
 """A sensor that has been silent for so long has no valid data [µs]."""
 
-
 LEARN_US = US_PER_S
 """A sensor that never repeated itself for so long, at rest, has noise [µs]."""
 

@@ -30,11 +30,7 @@ from firmware_sim.autopilot.navigation.plan import Plans
 from firmware_sim.autopilot.navigation.progress import progress
 from firmware_sim.autopilot.newest_sensors import NewestSensors
 from firmware_sim.engine.controller import Controller, ControlSetpoints
-from firmware_sim.interfaces import (
-    DistanceReading,
-    FlowReading,
-    SensorSample,
-)
+from firmware_sim.interfaces import SensorSample
 
 
 class Parts(NamedTuple):
@@ -123,25 +119,10 @@ class Snapshot:
     odometry = property(attrgetter("_parts.estimator.odometry"))
     odometry_us = property(attrgetter("_parts.estimator.odometry_us"))
 
-    @property
-    def distance(self) -> DistanceReading | None:
-        finder = self._parts.estimator.range
-        return None if finder is None else finder.reading
-
-    @property
-    def distance_us(self) -> int:
-        finder = self._parts.estimator.range
-        return 0 if finder is None else finder.reading_us
-
-    @property
-    def flow(self) -> FlowReading | None:
-        flow = self._parts.estimator.flow
-        return None if flow is None else flow.reading
-
-    @property
-    def flow_us(self) -> int:
-        flow = self._parts.estimator.flow
-        return 0 if flow is None else flow.reading_us
+    distance = property(lambda self: getattr(self._parts.estimator.range, "reading", None))
+    distance_us = property(lambda self: getattr(self._parts.estimator.range, "reading_us", 0))
+    flow = property(lambda self: getattr(self._parts.estimator.flow, "reading", None))
+    flow_us = property(lambda self: getattr(self._parts.estimator.flow, "reading_us", 0))
 
     @property
     def clearance(self) -> Clearance | None:

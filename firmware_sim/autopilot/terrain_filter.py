@@ -53,10 +53,8 @@ class TerrainFilter:
         self.walk_m_s, self.slope = 0.0, 0.0
         """EKF2_TERR_NOISE and EKF2_TERR_GRAD; both 0 while the ground is the height's reference."""
 
-    @property
-    def covariance(self) -> Vector:
-        """Of the 16 errors, (16, 16)."""
-        return self._inner.covariance
+    covariance = property(lambda self: self._inner.covariance)
+    """Of the 16 errors, (16, 16)."""
 
     def predict(self, state: Vector, gyro: Vector, accel: Vector) -> None:
         """Move the nominal state and all covariances by one tick."""

@@ -142,7 +142,7 @@ class PathLimits(NamedTuple):
 
 
 class Leg(NamedTuple):
-    """A way to a target; what lies before and behind it shapes the turns."""
+    """A way to a target. What lies before and behind it shapes the turns."""
 
     target: Vec
     """NED [m]."""

@@ -373,7 +373,7 @@ class YawEstimator:
 
     @property
     def attitude(self) -> Vector:
-        """Of the likeliest model (4,), body to world, wxyz; its tilt is that of all of them."""
+        """Of the likeliest model (4,), body to world, wxyz. Its tilt is that of all of them."""
         return self.models[int(np.argmax(self.models[:, WEIGHT])), ATTITUDE:BIAS].copy()
 
     def feel(self, gyro: Vector, accel: Vector) -> None:

@@ -121,11 +121,6 @@ class Controller:
         """Collective that is commanded, 0..1."""
         return self._output.item(_THRUST)
 
-    @property
-    def descending(self) -> bool:
-        """Whether the velocity setpoint points down, or nothing controls the velocity."""
-        return not self._output.item(_VELOCITY + 2) <= 0.0
-
     def setpoints(self) -> ControlSetpoints:
         """Return a copy of the setpoints of the newest tick."""
         row = self._output.copy()

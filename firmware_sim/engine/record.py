@@ -191,7 +191,7 @@ CONTROLLER = np.dtype(
         # Land detector.
         ("detecting", _I),  # NOTHING, LIFT_OFF or LANDING
         ("detected", _I),  # 1 = it was detected in the newest tick
-        ("land", _F, 6),  # thresholds, as `land_detector.thresholds`
+        ("land", _F, 7),  # thresholds, as `land_detector.thresholds`
         ("still_since_us", _I),  # -1 = the vehicle moves
     ],
     align=True,

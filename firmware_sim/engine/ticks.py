@@ -193,6 +193,12 @@ def _detect(c: Fields) -> bool:
 
 
 @kernel
+def detect_record(controller: Record) -> bool:
+    """Return whether the vehicle of a record (1,) has just left the ground, or come to rest."""
+    return _detect(controller[0])
+
+
+@kernel
 def command(c: Fields, flown: Fields) -> None:
     """Compute the motor commands of a tick and log it; note what is detected of the ground.
 

@@ -62,7 +62,7 @@ class ExternalFlightController:
 
     @property
     def flight(self) -> Flight:
-        """Phase and mode by its heartbeat; the bridge knows sooner whether it is armed."""
+        """Phase and mode by its heartbeat. The bridge knows sooner whether it is armed."""
         return self._observer.flight(armed=self._bridge.armed)
 
     def step(self, sample: SensorSample) -> ActuatorControls:
@@ -132,7 +132,7 @@ class ExternalFlightStack:
         return self._observer.receive(now_us)
 
     def log_to(self, tlog: TlogWriter | None) -> None:
-        """Write the observer's link to a tlog; the firmware's own log of the flight goes beside."""
+        """Write the observer's link to a tlog. The firmware's own log of the flight goes beside."""
         self._observer.log_to(tlog)
         if tlog is not None:
             self._launcher.flight_log = tlog.path.with_suffix(ULOG_SUFFIX)

@@ -37,10 +37,8 @@ class ParameterClient:
         self._values: dict[str, Value] = {}
         self._kinds: dict[str, int] = {}
 
-    @property
-    def values(self) -> Mapping[str, Value]:
-        """The values received so far."""
-        return self._values
+    values = property(lambda self: self._values)
+    """The values received so far."""
 
     def address(self, system: int, component: int, autopilot: int) -> None:
         """Set the target. PX4 encodes integers bytewise, ArduPilot casts them to a float."""

@@ -131,7 +131,7 @@ class StartCommand:
 
 
 class FirmwareProcess(ChildProcess):
-    """One process of external firmware; it ends with us, also when we are killed."""
+    """One process of external firmware. It ends with us, also when we are killed."""
 
     def __init__(self, name: str, command: StartCommand, cwd: Path, log: Path) -> None:
         """Start a program in a folder, output appended to `log`, or raise FirmwareMissingError."""

@@ -114,16 +114,14 @@ class FailingSender:
     """Sender to one peer over a failing link. Implements `endpoint.Endpoint`."""
 
     def __init__(self, endpoint: Endpoint, clock: Clock, *, conducted: bool) -> None:
-        """Take what sends over a healthy link; the rest as of `FailingEndpoint`."""
+        """Take what sends over a healthy link. The rest as of `FailingEndpoint`."""
         self.datagrams = endpoint.datagrams
         self.lane: Lane[bytes] = Lane()
         """Towards the peer."""
         self._endpoint, self._clock, self._conducted = endpoint, clock, conducted
 
-    @property
-    def send_errors(self) -> int:
-        """Chunks that could not be sent."""
-        return self._endpoint.send_errors
+    send_errors = property(lambda self: self._endpoint.send_errors)
+    """Chunks that could not be sent."""
 
     def receive(self) -> list[bytes]:
         """Return nothing: `FailingEndpoint.arrivals` has it."""
@@ -179,7 +177,7 @@ class FailingEndpoint(FailingSender):
         self._generators: dict[tuple[int, int, int], np.random.Generator] = {}
 
     def begin(self, timeline: FaultTimeline | None) -> None:
-        """Begin an episode with these faults, once for each; what was under way is lost."""
+        """Begin an episode with these faults, once for each. What was under way is lost."""
         self._timeline = timeline
         self._generators.clear()
         self._up.clear()

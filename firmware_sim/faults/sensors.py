@@ -68,7 +68,7 @@ class Stuck:
 
 
 class Late:
-    """Samples that come later; a sensor that must give something gives its oldest one meanwhile."""
+    """Samples that come later. A sensor that must give something gives its oldest one meanwhile."""
 
     def __init__(self, delay_s: float, *, always: bool) -> None:
         self._delay_us = round(delay_s * US_PER_S)

@@ -1,4 +1,4 @@
-"""Faults of an episode that act now, and that have acted; those of clients among them."""
+"""Faults of an episode that act now, and that have acted. Those of clients among them."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class FaultTimeline:
         self.begin(start_us)
 
     def begin(self, start_us: int) -> None:
-        """Say that the episode begins at `start_us` [µs]; what acted before is forgotten."""
+        """Say that the episode begins at `start_us` [µs]. What acted before is forgotten."""
         self._start_us = start_us
         self._entered.clear()
         self._spans.clear()

@@ -32,7 +32,7 @@ DESCRIBED = (
 """Facts of the vehicle by ULog's keys, beside its name."""
 
 _SAMPLES = 0
-"""Number of `SENSOR_COMBINED` in the file; the other topics follow in their order."""
+"""Number of `SENSOR_COMBINED` in the file. The other topics follow in their order."""
 
 
 class FlightLog:
@@ -60,7 +60,7 @@ class FlightLog:
         """The aircraft after the newest tick (`engine.record.TRUE_TICK`)."""
         self._parameters = parameters
         self._known = dict(_values(parameters))
-        self._writer = UlogWriter(
+        self.writer = UlogWriter(
             path,
             start_us,
             (SENSOR_COMBINED, *(logged.topic for logged in TOPICS)),
@@ -69,47 +69,13 @@ class FlightLog:
             on_lost,
         )
 
-    @property
-    def path(self) -> Path:
-        """The log's final name."""
-        return self._writer.path
-
-    @property
-    def partial_path(self) -> Path:
-        """The log's name until it is closed."""
-        return self._writer.partial_path
-
-    @property
-    def head_bytes(self) -> int:
-        """Size of what stands before the first sample."""
-        return self._writer.head_bytes
-
-    @property
-    def size_bytes(self) -> int:
-        """Size by now; a message ends here."""
-        return self._writer.size_bytes
-
-    @property
-    def written_bytes(self) -> int:
-        """Size of what stands in the file by now."""
-        return self._writer.written_bytes
-
-    @property
-    def closed(self) -> bool:
-        """Whether the log is complete."""
-        return self._writer.closed
-
-    def flush(self) -> None:
-        """Write out what is buffered, for somebody who reads it now."""
-        self._writer.flush()
-
     def after_ticks(self, flown: Record, truths: Record, state: AutopilotState) -> None:
         """Log what is due in n ticks, given their logs and the autopilot's state after the last."""
-        if self._writer.lost:
+        if self.writer.lost:
             return
         rows = (flown[name].tolist() for name in ("time_us", "gyro", "accel"))
         for k, (time_us, gyro, accel) in enumerate(zip(*rows, strict=True)):
-            self._writer.sample(_SAMPLES, time_us, sensor_combined(gyro, accel))
+            self.writer.sample(_SAMPLES, time_us, sensor_combined(gyro, accel))
             truth = truths[k - 1] if k else self._truth
             if time_us % GRID_US == 0 and truth is not None:
                 moment = Moment(
@@ -120,18 +86,18 @@ class FlightLog:
 
     def text(self, message: Message, time_us: int) -> None:
         """Log a text for the operator."""
-        self._writer.text(time_us, message.severity, message.text)
+        self.writer.text(time_us, message.severity, message.text)
 
     def parameters_changed(self) -> None:
         """Log the parameters that have other values than before."""
         for name, value in _values(self._parameters):
             if self._known[name] != value:
                 self._known[name] = value
-                self._writer.parameter(name, value)
+                self.writer.parameter(name, value)
 
     def close(self) -> None:
         """Complete the log and give it its final name; harmless when called again."""
-        self._writer.close()
+        self.writer.close()
 
     def _log(self, moment: Moment, now_us: int) -> None:
         due_us, last = self._due_us, self._last
@@ -144,7 +110,7 @@ class FlightLog:
                 continue
             last[i] = values
             due_us[i] = now_us + logged.interval_us
-            self._writer.sample(1 + i, now_us, values)
+            self.writer.sample(1 + i, now_us, values)
 
 
 def _values(parameters: ParameterStore) -> Iterable[tuple[str, int | float]]:

@@ -33,9 +33,9 @@ class LogFolder:
     def entries(self) -> Sequence[LogEntry]:
         """Return the logs, the one that is being written last."""
         entries = [_entry(path) for path in self._completed()]
-        if not self._current.closed:
+        if not self._current.writer.closed:
             began_s = self._current.began_unix_us // US_PER_S
-            entries.append(LogEntry(began_s, self._current.size_bytes))
+            entries.append(LogEntry(began_s, self._current.writer.size_bytes))
         return entries
 
     def read(self, number: int, offset: int, count: int) -> bytes:
@@ -43,10 +43,10 @@ class LogFolder:
         complete = self._completed()
         if 0 <= number < len(complete):
             path = complete[number]
-        elif number == len(complete) and not self._current.closed:
-            path = self._current.partial_path
-            if offset + count > self._current.written_bytes:
-                self._current.flush()
+        elif number == len(complete) and not self._current.writer.closed:
+            path = self._current.writer.partial_path
+            if offset + count > self._current.writer.written_bytes:
+                self._current.writer.flush()
         else:
             return b""
         try:
@@ -58,7 +58,7 @@ class LogFolder:
 
     def open_log(self) -> OpenLog | None:
         """Return the log that is being written, None when there is none."""
-        log = self._current
+        log = self._current.writer
         if log.closed:
             return None
         return OpenLog(len(self._completed()), log.head_bytes, log.size_bytes)
@@ -69,7 +69,7 @@ class LogFolder:
             self._files.popitem()[1].close()
 
     def _completed(self) -> Sequence[Path]:
-        seen = self._folder.stat().st_mtime_ns, self._current.closed
+        seen = self._folder.stat().st_mtime_ns, self._current.writer.closed
         if seen != self._seen:
             self.close()
             self._seen = seen

@@ -32,7 +32,7 @@ MAX_COMPONENTS = 64
 """Systems and components behind one client, as behind a router."""
 
 FORWARDS_PER_S = 250
-"""Frames of one client that are passed on to others for long; a flood must not reach them."""
+"""Frames of one client that are passed on to others for long. A flood must not reach them."""
 
 SILENT_US = 600 * US_PER_S
 """A client that has said nothing for so long in simulated time is forgotten [µs]."""
@@ -252,7 +252,7 @@ class Clients:
         return client, messages
 
     def _room(self, now_us: int) -> bool:
-        """Return whether another client can be taken; who has gone silent makes room."""
+        """Return whether another client can be taken. Who has gone silent makes room."""
         learned = [client for peer, client in self._clients.items() if peer is not None]
         if len(learned) < MAX_CLIENTS:
             return True

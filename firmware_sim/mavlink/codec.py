@@ -187,7 +187,7 @@ class Encoder:
         self.identify(system_id)
 
     def identify(self, system_id: int) -> None:
-        """Send as another system from now on; the sequence goes on."""
+        """Send as another system from now on. The sequence goes on."""
         self._mav.srcSystem = system_id
         self._ids = bytes([system_id, self._component_id])
 
@@ -196,10 +196,8 @@ class Encoder:
         """System id of the sender."""
         return self._ids[0]
 
-    @property
-    def sequence(self) -> int:
-        """Sequence number of the next frame."""
-        return self._seq
+    sequence = property(lambda self: self._seq)
+    """Sequence number of the next frame."""
 
     def skip(self, frames: int) -> None:
         """Count frames that something else has packed."""

@@ -60,7 +60,7 @@ def _digest() -> str:
 
 
 def generated(folder: Path) -> Path:
-    """Return the module's file in a folder; it is made if it is not there."""
+    """Return the module's file in a folder. It is made if it is not there."""
     path = folder / f"{_NAME}.py"
     if not path.is_file():
         # Only here: a start that finds the module must not wait for the generator's import.

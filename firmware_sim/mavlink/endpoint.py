@@ -88,9 +88,9 @@ class MemoryEndpoint:
 
     def __init__(self) -> None:
         self.inbox: deque[bytes] = deque()
-        """Chunks for the vehicle; the other side appends."""
+        """Chunks for the vehicle. The other side appends."""
         self.outbox: deque[bytes] = deque()
-        """Frames from the vehicle; the other side takes from the left."""
+        """Frames from the vehicle. The other side takes from the left."""
         self.send_errors = 0
 
     def receive(self) -> list[bytes]:

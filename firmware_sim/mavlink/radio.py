@@ -17,7 +17,7 @@ _FULL_SIGNAL = 100
 
 
 class Radio:
-    """What the newest RC_CHANNELS_OVERRIDE said; the same for all clients."""
+    """What the newest RC_CHANNELS_OVERRIDE said. The same for all clients."""
 
     def __init__(self) -> None:
         self._said: tuple[int, ...] = ()

@@ -91,7 +91,7 @@ class StreamScheduler:
         self.wake_us = 0
 
     def packed(self, next_us: int) -> None:
-        """Take note that fast streams were packed; the next of them is due at `next_us` [µs]."""
+        """Take note that fast streams were packed. The next of them is due at `next_us` [µs]."""
         self.fast_us = next_us
         self.wake_us = min(next_us, self._next_us)
 

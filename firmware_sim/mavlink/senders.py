@@ -35,7 +35,7 @@ class Senders:
 
     def __init__(self) -> None:
         self._announced: set[tuple[int, int]] = set()
-        """System and component ids; they hold for as long as the links are open."""
+        """System and component ids. They hold for as long as the links are open."""
         self._commands: Counter[tuple[int, int, str]] = Counter()
 
     def note(self, message: WireMessage) -> None:

@@ -176,7 +176,7 @@ class SlowCamera:
         return self._next_us if self._taken_us is None else self._taken_us
 
     def restart(self, time_us: int) -> None:
-        """Begin an episode at `time_us` [µs]; a frame that is being taken is dropped."""
+        """Begin an episode at `time_us` [µs]. A frame that is being taken is dropped."""
         self._taken_us, self._next_us = None, time_us
         self._process.send(_Restart(time_us))
 

@@ -32,7 +32,7 @@ class _Eye:
     def __init__(
         self, camera: Camera, arena: Arena, noise: SensorNoise, renderer: Renderer, name: str = ""
     ) -> None:
-        """Take the camera, what it sees, conditions, what draws, and a further camera's name."""
+        """Take the camera, its arena, conditions, the renderer, and a further camera's name."""
         self._expose = exposure_by(renderer, name)
         self._noise = noise_of(camera, noise, name)
         self._forming = ImageFormation(camera, name) if camera.imaging is not None else None

@@ -72,7 +72,7 @@ class Blowing(Protocol):
 
 
 class Collision(NamedTuple):
-    """The vehicle began to touch something; the floor only when faster than REST_SPEED_M_S."""
+    """The vehicle began to touch something. The floor only when faster than REST_SPEED_M_S."""
 
     time_us: int
     what: str
@@ -122,7 +122,7 @@ class Plant:
         self.wind: Blowing = Wind(asked.wind, gusts, tick_s)
         """Asked for what blows; to be replaced between two ticks."""
         self._winds = np.zeros((0, 3))
-        """Wind NED [m/s] of the coming ticks; a single row does not change."""
+        """Wind NED [m/s] of the coming ticks. A single row does not change."""
         fitted, times = profile.sensors.rangefinder, asked.sensors.navigation_noise
         self._rangefinder = None
         if fitted is not None:

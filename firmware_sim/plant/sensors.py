@@ -26,7 +26,7 @@ from firmware_sim.interfaces import BatterySample, GpsFix, Odometry, SensorSampl
 GPS_SATELLITES = 12
 
 BLOCK = 128
-"""Samples for which noise is drawn at once; the number does not affect the values."""
+"""Samples for which noise is drawn at once. The number does not affect the values."""
 
 _WIDTHS = (12, 3, 2, 9)
 """Numbers of white noise in a sample of accelerometer and gyro, compass, barometer, GPS."""

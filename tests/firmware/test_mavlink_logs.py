@@ -43,7 +43,7 @@ class LoggedAutopilot(KinematicAutopilot):
     def step(self) -> None:
         super().step()
         sample = self.sample
-        if sample is None or self.log.closed:
+        if sample is None or self.log.writer.closed:
             return
         estimate = self.state().estimate
         truths = np.zeros(1, TRUE_TICK)
@@ -100,12 +100,12 @@ def test_logs_are_listed_oldest_first(rig: Rig, autopilot: LoggedAutopilot) -> N
     old, current = rig.client.received("LOG_ENTRY")
     assert (old.id, old.num_logs, old.last_log_num, old.size) == (0, 2, 1, 768)
     assert (current.id, current.time_utc) == (1, BOOT_UNIX_US // 1_000_000)
-    assert 4_000 < current.size <= autopilot.log.size_bytes
+    assert 4_000 < current.size <= autopilot.log.writer.size_bytes
     autopilot.log.close()
     rig.client.send(dialect.MAVLink_log_request_list_message(*TARGET, 1, 1))
     rig.bench.run(0.1)
     (complete,) = rig.client.received("LOG_ENTRY")
-    assert (complete.id, complete.size) == (1, autopilot.log.path.stat().st_size)
+    assert (complete.id, complete.size) == (1, autopilot.log.writer.path.stat().st_size)
 
 
 def test_a_vehicle_without_logs_says_so() -> None:
@@ -130,7 +130,7 @@ def test_the_log_that_is_written_is_downloaded(
     rig: Rig, autopilot: LoggedAutopilot, tmp_path: Path
 ) -> None:
     rig.bench.run(1.0)
-    size = autopilot.log.size_bytes
+    size = autopilot.log.writer.size_bytes
     part = download(rig, 1, 0, size)
     (tmp_path / "part.log").write_bytes(part)
     assert len(part) == size

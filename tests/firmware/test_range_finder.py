@@ -20,13 +20,15 @@ from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.model import Scenario
 from airl_mav.scenario.resolve import resolve
 from firmware_sim.autopilot.autopilot_state import Clearance, Mode, Result
-from firmware_sim.autopilot.error_state import ROW_SIZE, V
+from firmware_sim.autopilot.error_state import V
 from firmware_sim.autopilot.land_detector import LandDetector
 from firmware_sim.autopilot.manual_control import Source, Sticks
 from firmware_sim.autopilot.modes.land import landing_speed
 from firmware_sim.autopilot.modes.terrain_hold import Piloting, TerrainHold
 from firmware_sim.autopilot.range_finder import RangeFinder
 from firmware_sim.crash_detector import TOUCHDOWN_M_S
+from firmware_sim.engine.record import LANDING, new_controller
+from firmware_sim.engine.ticks import detect_record
 from firmware_sim.external.px4 import hil_messages as hil
 from firmware_sim.flight_log import values
 from firmware_sim.interfaces import DOWNWARD, DistanceReading, SensorSample
@@ -326,6 +328,18 @@ def ground(dist_bottom_m: float, *, valid: bool = True, by_range: bool = True) -
     ],
 )
 def test_landing_is_believed_near_the_ground(told: Clearance | None, needed_s: float) -> None:
+    assert landing_s(told) == pytest.approx(needed_s, nan_ok=True)
+
+
+@pytest.mark.parametrize(
+    ("down_m_s", "needed_s"), [(NAN, 1.0), (0.1, 1.0), (0.0, NAN), (-0.1, NAN)]
+)
+def test_landing_is_believed_unless_the_height_is_held(down_m_s: float, needed_s: float) -> None:
+    assert landing_s(None, down_m_s) == pytest.approx(needed_s, nan_ok=True)
+
+
+def landing_s(told: Clearance | None, down_m_s: float = 0.1) -> float:
+    """Return when a vehicle at rest, told to move downwards so fast, has landed [s]."""
     asked = {
         "LNDMC_TRIG_TIME": 1.0,
         "LNDMC_Z_VEL_MAX": 0.25,
@@ -333,18 +347,16 @@ def test_landing_is_believed_near_the_ground(told: Clearance | None, needed_s: f
         "MPC_THR_MIN": 0.12,
         "MPC_THR_HOVER": 0.5,
     }
-    detector, state = LandDetector(asked.__getitem__), np.zeros(ROW_SIZE)
-    state[V + 2] = 0.1
-    detector.ground = told
-    landed = next(
-        (
-            ms / 1e3
-            for ms in range(0, 10_000, 100)
-            if detector.landed(state, ms * 1_000, 0.12, descending=True)
-        ),
-        NAN,
-    )
-    assert landed == pytest.approx(needed_s, nan_ok=True)
+    record = new_controller()
+    LandDetector(asked.__getitem__, record).see(told)
+    record["detecting"], record["state"][0, V + 2] = LANDING, 0.1
+    record["output"][0, 7:] = 0.0, 0.0, down_m_s, 0.12  # velocity, thrust
+
+    def detected(ms: int) -> bool:
+        record["time_us"] = ms * 1_000
+        return detect_record(record)
+
+    return next((ms / 1e3 for ms in range(0, 10_000, 100) if detected(ms)), NAN)
 
 
 # --- messages

@@ -645,7 +645,6 @@ def test_the_controller_is_the_cascade_tick(
         assert tuple(told.rates) == out.rates
         assert tuple(told.velocity) == out.velocity
         assert told.thrust == controller.thrust == out.thrust
-        assert controller.descending == (out.velocity[2] > 0.0)
 
 
 def test_a_controller_at_rest_winds_nothing_up() -> None:
@@ -655,10 +654,9 @@ def test_a_controller_at_rest_winds_nothing_up() -> None:
     for _ in range(50):
         wound = controller.fly(state, demand)
         cascade_tick(ZERO, ZERO, LEVEL, ZERO, demand, memory, GAINS, FILTERS, TICK_S)
-    assert controller.descending
     controller.rest()
     reset_integrals(memory)
-    assert (controller.thrust, controller.descending) == (0.0, False)
+    assert controller.thrust == 0.0
     told = controller.setpoints()
     assert (told.attitude.tolist(), told.rates.tolist()) == ([1.0, 0.0, 0.0, 0.0], [0.0] * 3)
     after = controller.fly(state, demand)

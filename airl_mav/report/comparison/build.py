@@ -28,7 +28,7 @@ UNCOMPARED = ("sha256 of the flights",)
 """Terms that always differ, and explain nothing."""
 
 MACHINE_TERMS = ("cpu", "os")
-"""What is told of the machine that flew, of what its run says."""
+"""Entries of `run.json` about the machine that a comparison shows."""
 
 
 def compare(

@@ -38,7 +38,7 @@ class ReplayedRuns:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """What they are called."""
+        """Their names."""
         return tuple(self._folders)
 
     def name_of(self, run: ReplayedRun) -> str:
@@ -65,7 +65,7 @@ class ReplayedRun:
         self._vehicle: VehicleProfile = vehicle_of(self._run.info)
         self.path, self.info = path, self._run.info
         self.title = f"{self._run.info.setup.policy.name} in {self._run.info.setup.arena.name}"
-        """What was flown where."""
+        """Flights and their arenas."""
         paths = self._run.trajectories
         recorded = [e for e in ranked(self._run) if e.index in paths and len(paths[e.index])]
         if not recorded:

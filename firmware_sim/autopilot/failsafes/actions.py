@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 
 class Action(IntEnum):
-    """What a failsafe does; of several the greatest is taken."""
+    """Action of a failsafe. The greatest of several counts."""
 
     NONE = 0
     WARN = 1
@@ -39,7 +39,7 @@ class Clear(Enum):
 
 
 class Takeover(IntEnum):
-    """Who may end an action by flying on; of several actions the strictest counts."""
+    """Who may end an action by flying on. The strictest of several counts."""
 
     ALWAYS = 0
     MODE_SWITCH = 1
@@ -50,7 +50,7 @@ class Takeover(IntEnum):
 
 
 class Cause(Enum):
-    """What a text names as the cause."""
+    """Cause, as texts name it."""
 
     GENERIC = auto()
     MANUAL_CONTROL_LOSS = auto()

@@ -44,7 +44,7 @@ _GROUND = Phase.GROUND
 
 
 class Decision(NamedTuple):
-    """What a failsafe makes of a flight."""
+    """Decision of the failsafes."""
 
     flight: Flight
     text: Message | None
@@ -65,13 +65,13 @@ class Supervisor:
         self._value = value
         self._estimator = estimator
         self.watch = Watch(value, estimator)
-        """What is heard and measured."""
+        """Signals and measurements."""
         self.sensors = self.watch.sensors
         """Which sensors can be believed."""
         self.next_us = 0
         """When to look next: any earlier look does no harm."""
         self.conditions = Conditions()
-        """What was wrong at the last look."""
+        """Conditions at the last look."""
         self.changes = 0
         """Number of looks at which conditions or readiness had changed."""
         self.failing: tuple[Check, ...] = ()

@@ -31,7 +31,7 @@ _PACKETS = {40: (MAGIC_16, struct.Struct("<HHI16H")), 72: (MAGIC_32, struct.Stru
 
 
 class ServoPacketError(ValueError):
-    """A datagram is not a servo packet; the message says why."""
+    """A datagram is not a servo packet. The message says why."""
 
 
 class ServoPacket(NamedTuple):
@@ -102,7 +102,7 @@ PWM_MIN_US, PWM_MAX_US = 1000, 2000
 """Pulses of a stopped motor (MOT_PWM_MIN) and of full thrust (MOT_PWM_MAX) [µs]."""
 
 MOTORS = 4
-"""Servo outputs 1 to 4 are the motors; the airframe says which is which."""
+"""Servo outputs 1 to 4 are the motors. The airframe says which is which."""
 
 
 class ArdupilotBridge:

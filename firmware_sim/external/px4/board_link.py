@@ -165,7 +165,7 @@ _MAVLINK_VERSION = 3
 
 
 class BoardLink:
-    """A board that may vanish during a reboot; nothing is sent before something was received."""
+    """A board that may vanish during a reboot. Nothing is sent before something was received."""
 
     def __init__(self, router: Router, device: str, baud: int) -> None:
         """Configure a serial line for a router with lasting clients; UsageError if too slow."""
@@ -176,7 +176,7 @@ class BoardLink:
         self.device = device
         self.clock = WallClock()
         self.board = Board(self.clock)
-        """What was received from it; a new object each time that the device is opened."""
+        """What was received from it. A new object each time that the device is opened."""
         self._router = router
         self._baud = baud
         self._budget_bytes_s = check_line(device, baud)

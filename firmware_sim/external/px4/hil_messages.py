@@ -26,7 +26,7 @@ FLOW = layout("HIL_OPTICAL_FLOW")
 
 
 class Answer(NamedTuple):
-    """HIL_ACTUATOR_CONTROLS, in the order in which it is sent; the names are MAVLink's."""
+    """HIL_ACTUATOR_CONTROLS, in the order in which it is sent. The names are MAVLink's."""
 
     time_usec: int
     flags: int
@@ -132,7 +132,7 @@ def gps(fix: interfaces.GpsFix, time_us: int) -> Values:
 
 
 def odometry(seen: interfaces.Odometry, time_us: int) -> Values:
-    """Return ODOMETRY at the firmware's time [µs]; what is not measured is NaN."""
+    """Return ODOMETRY at the firmware's time [µs]. What is not measured is NaN."""
     return (
         time_us,
         _POSE_FRAMES[seen.pose_frame],
@@ -168,7 +168,7 @@ def distance(told: interfaces.DistanceReading, time_us: int) -> Values:
 
 
 def flow(told: interfaces.FlowReading, time_us: int) -> Values:
-    """Return HIL_OPTICAL_FLOW at the firmware's time [µs]; it tells no distance."""
+    """Return HIL_OPTICAL_FLOW at the firmware's time [µs]. It tells no distance."""
     temperature, since_us, distance_m = 0, 0, -1.0
     return (
         time_us,

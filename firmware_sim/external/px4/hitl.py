@@ -27,7 +27,7 @@ FIRST_CONTROLS_US = 10 * US_PER_S
 """Longest time with sensors but without motor commands [wall µs]."""
 
 EPOCH_US = US_PER_S
-"""Time in the first sample [µs]; the board takes its own clock's instead."""
+"""Time in the first sample [µs]. The board takes its own clock's instead."""
 
 _CREEP_US = 20
 _BEHIND_US = 20_000
@@ -69,7 +69,7 @@ class HitlBridge:
     rate_hz = TICK_HZ
 
     def __init__(self, link: BoardLink) -> None:
-        """Take the link to the board, which goes from episode to episode; it is not opened yet."""
+        """Take the link to the board, which goes from episode to episode. It is not opened yet."""
         self.armed = False
         self.time_us = 0
         self._link = link

@@ -131,7 +131,7 @@ class Router:
     datagrams = True
 
     def __init__(self, clients: Mapping[str, Endpoint], clock: Clock) -> None:
-        """Take the clients' ends by the names of their links; the router closes them."""
+        """Take the clients' ends by the names of their links. The router closes them."""
         self.lost: str | None = None
         """Why the line is gone; None while there is one, or none was there yet."""
         self.on_message: Callable[[WireMessage], None] | None = None
@@ -159,7 +159,7 @@ class Router:
     # --- the line
 
     def attach(self, line: Line, budget_bytes_s: int) -> None:
-        """Replace the line to the board, with a client budget [bytes/s]; the caller closes it."""
+        """Replace the line to the board, with a client budget [bytes/s]. The caller closes it."""
         self.detach()
         self._line, self._line_fd = line, line.fileno()
         self._selector.register(self._line_fd, selectors.EVENT_READ)

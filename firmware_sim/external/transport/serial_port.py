@@ -118,7 +118,7 @@ class SerialPort:
         return self._fd
 
     def close(self) -> None:
-        """Close it; what the line does not accept soon is lost. Harmless when called again."""
+        """Close it. What the line does not accept soon is lost. Harmless when called again."""
         with suppress(SerialLostError, OSError, TypeError):  # pyserial's, when it is closed
             for _ in range(_LAST_CHANCES):
                 self.drain()

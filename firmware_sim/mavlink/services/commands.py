@@ -40,7 +40,7 @@ FORCE_MAGIC = 21_196
 """MAV_CMD_COMPONENT_ARM_DISARM param2 that skips the checks."""
 
 TERMINATE_FROM = 0.5
-"""Parameter 1 must exceed this; a termination cannot be undone (PX4: DENIED)."""
+"""Parameter 1 must exceed this. A termination cannot be undone (PX4: DENIED)."""
 
 # Names made anew for each message would stay in the interpreter's cache of attributes.
 _PARAMS = attrgetter(*(f"param{number}" for number in range(1, 8)))

@@ -211,4 +211,4 @@ OPERATIONS: dict[int, Operation] = {
     12: _truncate,
     13: _rename,
 }
-"""By opcode; what takes several ticks (checksums, burst reads) stands in `ftp`."""
+"""By opcode. What takes several ticks (checksums, burst reads) stands in `ftp`."""

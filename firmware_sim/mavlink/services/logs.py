@@ -23,7 +23,7 @@ ENTRIES_PER_TICK = 1
 PACKETS_PER_TICK = 8
 """LOG_DATA of one client: 180 kB a second."""
 PIECES_PER_TICK = 2
-"""LOGGING_DATA of one client: 125 kB a second; the log grows by 25 kB."""
+"""LOGGING_DATA of one client: 125 kB a second. The log grows by 25 kB."""
 
 _PACKET_BYTES = 90
 """LOG_DATA.data."""

@@ -168,7 +168,7 @@ def parse(message: WireMessage) -> PlanItem | int:
 
 
 def belongs(item: PlanItem, kind: Kind) -> bool:
-    """Return whether an item may be part of such a list; a polygon has at least 3 vertices."""
+    """Return whether an item may be part of such a list. A polygon has at least 3 vertices."""
     if kind is Kind.MISSION:
         return item.command not in _NOT_IN_MISSIONS
     if kind is Kind.FENCE and item.command in _POLYGONS:

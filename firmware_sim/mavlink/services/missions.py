@@ -114,7 +114,7 @@ def handle_ack(message: WireMessage, context: Context) -> bool:
 
 
 def handle_count(message: WireMessage, context: Context) -> bool:
-    """MISSION_COUNT: begin an upload; a count of 0 clears the list."""
+    """MISSION_COUNT: begin an upload. A count of 0 clears the list."""
     transfer, partner = context.transfer, sender(message)
     _settle(transfer)
     if transfer.activity is _SENDING:
@@ -235,7 +235,7 @@ def handle_clear(message: WireMessage, context: Context) -> bool:
 
 
 def handle_set_current(message: WireMessage, context: Context) -> bool:
-    """MISSION_SET_CURRENT: choose the item to go on with; the mode does not change."""
+    """MISSION_SET_CURRENT: choose the item to go on with. The mode does not change."""
     plans = context.port.plans
     _settle(context.transfer)
     if context.transfer.activity is not _IDLE:

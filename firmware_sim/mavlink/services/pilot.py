@@ -35,7 +35,7 @@ def is_for_radio(message: WireMessage, context: Context) -> bool:
 
 
 def handle_manual_control(message: WireMessage, context: Context) -> bool:
-    """MANUAL_CONTROL: the throttle is 0..1000, the others -1000..1000; what is not counts as 0."""
+    """MANUAL_CONTROL: the throttle is 0..1000, the others -1000..1000. What is not counts as 0."""
     sticks = Sticks(
         roll=_share(message.y),
         pitch=_share(message.x),

@@ -30,7 +30,7 @@ _LONGEST_LINE = 256
 """What is typed beyond this before the line ends is dropped [bytes]."""
 
 _LONGEST_OUTPUT = 1 << 17
-"""Text that waits to be sent; a client that asks for more before it was sent gets no more."""
+"""Text that waits to be sent. A client that asks for more before it was sent gets no more."""
 
 
 def handle_input(message: WireMessage, context: Context) -> bool:

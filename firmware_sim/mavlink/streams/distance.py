@@ -25,7 +25,7 @@ _QUALITY_NOT_TOLD = 0
 
 
 def distance_sensor(state: AutopilotState) -> Values | None:
-    """The newest distance [cm]; nothing where none comes. PX4 does not send its quality."""
+    """The newest distance [cm]. Nothing where none comes. PX4 does not send its quality."""
     told = state.distance
     if told is None or state.time_us - state.distance_us > NEW_US:
         return None

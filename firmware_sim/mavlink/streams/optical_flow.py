@@ -16,7 +16,7 @@ _FIRST, _TEMPERATURE, _NO_DISTANCE_US, _NO_DISTANCE_M = 0, 0, 0, -1.0
 
 
 def optical_flow_rad(state: AutopilotState) -> Values | None:
-    """The newest flow and turn [rad]; nothing where none comes."""
+    """The newest flow and turn [rad]. Nothing where none comes."""
     told = state.flow
     if told is None or state.time_us - state.flow_us > NEW_US:
         return None

@@ -16,7 +16,7 @@ _NO_APPROACH = (0.0, 0.0, 0.0)
 
 
 def orbit_execution_status(state: AutopilotState) -> Values | None:
-    """The circle that is flown: its centre on the globe; nothing in other modes."""
+    """The circle that is flown: its centre on the globe. Nothing in other modes."""
     orbit, origin = state.orbit, state.origin
     if orbit is None or origin is None:
         return None
@@ -32,7 +32,7 @@ def orbit_execution_status(state: AutopilotState) -> Values | None:
 
 
 def home_position(state: AutopilotState) -> Values | None:
-    """Home on the globe and in local NED; nothing before it is set."""
+    """Home on the globe and in local NED. Nothing before it is set."""
     home, origin = state.home, state.origin
     if home is None:
         return None
@@ -45,7 +45,7 @@ def home_position(state: AutopilotState) -> Values | None:
 
 
 def gps_global_origin(state: AutopilotState) -> Values | None:
-    """The point of the globe where local NED is zero; nothing before it is set."""
+    """The point of the globe where local NED is zero. Nothing before it is set."""
     return None if state.origin is None else (*_wire(state.origin), state.time_us)
 
 

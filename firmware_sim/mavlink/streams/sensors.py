@@ -46,7 +46,7 @@ def scaled_pressure(state: AutopilotState) -> Values:
 
 
 def mag_cal_report(value: Callable[[str], float]) -> Values | None:
-    """Calibration of the compass [gauss], of the parameters; nothing while it has none."""
+    """Calibration of the compass [gauss], of the parameters. Nothing while it has none."""
     if not value("CAL_MAG0_ID"):
         return None
     number, being_calibrated, autosaved, fitness = 0, 0, 0, 0.0

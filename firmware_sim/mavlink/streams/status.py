@@ -111,7 +111,7 @@ def manual_control(state: AutopilotState, system_id: int) -> Values | None:
 
 
 def extended_sys_state(state: AutopilotState) -> Values:
-    """Landed state; the vehicle is no VTOL."""
+    """Landed state. The vehicle is no VTOL."""
     return dialect.MAV_VTOL_STATE_UNDEFINED, _LANDED[state.status.landed]
 
 

@@ -81,7 +81,7 @@ DIAGONAL = (0, 6, 11, 15, 18, 20)
 
 
 def triangle(diagonal: Sequence[float]) -> tuple[float, ...]:
-    """Return a matrix as it is sent, by its diagonal (6,); the rest is not known: NaN."""
+    """Return a matrix as it is sent, by its diagonal (6,). The rest is not known: NaN."""
     a, b, c, d, e, f = diagonal
     n = math.nan
     return a, n, n, n, n, n, b, n, n, n, n, c, n, n, n, d, n, n, e, n, f

@@ -39,7 +39,7 @@ class VibrationMeter:
         _update(self._memory, flown)
 
     def message(self, state: AutopilotState) -> Values:
-        """Return VIBRATION; there is one accelerometer."""
+        """Return VIBRATION. There is one accelerometer."""
         coning, gyro, accel, clipped = self._memory[: _CLIPPED + 1].tolist()
         clipping_1 = clipping_2 = 0
         return state.time_us, coning, gyro, accel, int(clipped), clipping_1, clipping_2
