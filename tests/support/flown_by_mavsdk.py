@@ -54,9 +54,11 @@ class Flown:
 
     @contextmanager
     def at(self, speed: float) -> Iterator[Callable[[float], None]]:
-        """Let simulated time run at a speed meanwhile; what is yielded takes the time seen [s]."""
+        """Let simulated time run at a speed meanwhile.
+
+        It waits for a test that calls what is yielded, with the time that it has seen [s].
+        """
         before, self.speed = self.speed, speed
-        self._see(self.simulation.time_us / US_PER_S)
         try:
             yield self._see
         finally:
