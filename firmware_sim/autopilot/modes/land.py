@@ -34,9 +34,8 @@ class Land(FlightMode):
     def __init__(self, context: FlightContext, /) -> None:
         self._context = context
         self._place = Place((0.0, 0.0, 0.0), 0.0)
-        self._stopping = False
+        self._stopping, self._began = False, (0.0, 0.0)
         self._is_slow = False
-        """Whether the descent no longer changes its speed."""
 
     @property
     def is_steady(self) -> bool:
@@ -45,13 +44,14 @@ class Land(FlightMode):
 
     @property
     def destination(self) -> Vec | None:
-        """The ground below, as high as home."""
-        north, east, _ = self._place.position
+        """The ground below the place where the mode began, as high as home."""
+        north, east = self._began
         return north, east, self._context.home[2]
 
     def enter(self, state: Vector, _request: Request | None, /) -> None:
         """Begin at the present place."""
         self._place, self._stopping = here(state), True
+        self._began = self._place.position[:2]
 
     def demand(self, state: Vector, _time_us: int, /) -> Demand:
         """Stop first, then hold that place; descend all the while."""
