@@ -330,7 +330,7 @@ class Firmware:
     def _hear(self, message: Message) -> None:
         if self.simulation is not None:
             now_us = self.simulation.time_us
-            if self.simulation.is_flying:
+            if self.epoch_ns is None and self.simulation.is_flying:
                 self.clock.sleep_until(now_us)  # it stands while a stretch of ticks is flown
             if self._flight_log is not None:
                 self._flight_log.text(message, now_us)
