@@ -98,8 +98,10 @@ class ChildProcess:
         self.stdout = self._process.stdout
         """The pipe that it writes to; None where that is not captured."""
 
-    pid = property(lambda self: self._process.pid)
-    """Process id."""
+    @property
+    def pid(self) -> int:
+        """Process id."""
+        return self._process.pid
 
     def poll(self) -> Exited | None:
         """Return how it ended; None while it runs."""

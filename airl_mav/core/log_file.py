@@ -41,10 +41,15 @@ class LogFile:
         """Size by now, with what is not yet written."""
         return self._written + len(self._buffer)
 
-    written_bytes = property(lambda self: self._written)
-    """Size of what stands in the file by now."""
-    closed = property(lambda self: self._file.closed)
-    """Whether the log is complete."""
+    @property
+    def written_bytes(self) -> int:
+        """Size of what stands in the file by now."""
+        return self._written
+
+    @property
+    def closed(self) -> bool:
+        """Whether the log is complete."""
+        return self._file.closed
 
     def add(self, time_us: int, *parts: bytes) -> None:
         """Add one record, in parts, at simulated `time_us` [µs]."""

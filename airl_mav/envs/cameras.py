@@ -174,10 +174,15 @@ class Cameras(Stateful):
         self._freeze_us = {number: np.zeros(n, np.int64) for number in stuck}
         """When it was taken, or will be [µs]."""
 
-    intrinsics = property(lambda self: self._main.intrinsics)
-    """Of the main camera."""
-    image = property(lambda self: self._main.image)
-    """(n, ...) newest images of the main cameras, as `camera.frame.Frame.image` of each."""
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """Of the main camera."""
+        return self._main.intrinsics
+
+    @property
+    def image(self) -> NDArray[Any]:
+        """(n, ...) newest images of the main cameras, as `camera.frame.Frame.image` of each."""
+        return self._main.image
 
     @property
     def latest_us(self) -> int:

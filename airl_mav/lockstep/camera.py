@@ -67,8 +67,10 @@ class MemoryCamera:
         self.publish = self._under_way.send
         self._newest: ReceivedFrame | None = None
 
-    awaited = property(lambda self: self._under_way.awaited)
-    """Whether the companion waits for the next exposure."""
+    @property
+    def awaited(self) -> bool:
+        """Whether the companion waits for the next exposure."""
+        return self._under_way.awaited
 
     def close(self) -> None:
         """Forget all frames."""
@@ -118,8 +120,10 @@ class TokenCamera:
         self._server = server
         self._newest: Frame | None = None
 
-    awaited = property(lambda self: self.under_way.awaited)
-    """Whether the companion waits for the next exposure."""
+    @property
+    def awaited(self) -> bool:
+        """Whether the companion waits for the next exposure."""
+        return self.under_way.awaited
 
     def publish(self, frame: Frame) -> None:
         """Send a frame on its way, in simulated time."""

@@ -48,8 +48,10 @@ class Judge:
         """When the companion may have an order by the passing of time [µs]; inf = never."""
         return math.inf if self._supervisor is None else self._supervisor.due_us
 
-    hit = property(lambda self: self._crash.hit)
-    """What has been hit so far."""
+    @property
+    def hit(self) -> str | None:
+        """What has been hit so far."""
+        return self._crash.hit
 
     def enter(self, phase: str, time_us: int) -> None:
         """The companion has entered a phase, at a simulated time [µs]."""

@@ -78,10 +78,15 @@ class RemoteStage:
         """When to end the flight at the latest [µs]."""
         self._conductor.orders_us = lambda: min(self.end_us, self._judge.due_us)
 
-    ended = property(lambda self: self._conductor.ended)
-    """Whether the companion has ended, or was given up."""
-    turns = property(lambda self: self._partner.turns)
-    """Turns that the companion has had."""
+    @property
+    def ended(self) -> bool:
+        """Whether the companion has ended, or was given up."""
+        return self._conductor.ended
+
+    @property
+    def turns(self) -> int:
+        """Turns that the companion has had."""
+        return self._partner.turns
 
     @property
     def time_us(self) -> int:

@@ -93,8 +93,10 @@ class TokenPartner:
         self._phases: set[str] = set()
         """Told in this turn."""
 
-    turns = property(lambda self: self._number)
-    """Turns given so far."""
+    @property
+    def turns(self) -> int:
+        """Turns given so far."""
+        return self._number
 
     def order(self, order: Order) -> None:
         """Tell the companion what to do, in its next turn."""

@@ -58,8 +58,10 @@ class Episode:
     navigating_us: int | None = None
     """When navigation began, by the companion's clock, which has given up no time [µs]."""
 
-    referee = property(lambda self: self.supervisor.referee)
-    """The referee."""
+    @property
+    def referee(self) -> Referee:
+        """The referee."""
+        return self.supervisor.referee
 
     @property
     def separated(self) -> str | None:

@@ -6,7 +6,7 @@ import math
 from enum import Enum
 
 from airl_mav.core.constants import US_PER_S
-from airl_mav.flight.judge import Outcome, Referee, TruthSample
+from airl_mav.flight.judge import Outcome, Referee, TruthSample, Verdict
 
 TAKEOFF_LIMIT_S = 90.0
 """Longest time from the reset to the start of navigation [simulated s]."""
@@ -35,8 +35,10 @@ class Supervisor:
         """When the episode began [µs]."""
         self._called_off = False
 
-    verdict = property(lambda self: self.referee.verdict)
-    """The verdict, once there is one."""
+    @property
+    def verdict(self) -> Verdict | None:
+        """The verdict, once there is one."""
+        return self.referee.verdict
 
     @property
     def due_us(self) -> float:

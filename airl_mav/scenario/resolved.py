@@ -81,8 +81,10 @@ class ResolvedScenario:
     watchdog: WatchdogSettings
     """Bounds on silence, with what the policy's card says of hovering."""
 
-    seeds = property(lambda self: self.scenario.seeds)
-    """Seed of each episode, by index."""
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        """Seed of each episode, by index."""
+        return self.scenario.seeds
 
     def left(self, done: Iterable[EpisodeRecord] = ()) -> list[PlannedEpisode]:
         """Return what is left to be flown when some episodes are done."""

@@ -16,6 +16,7 @@ from airl_mav.flight.statistics import CONFIDENCE, Estimate, wilson
 from airl_mav.latency.injection import ESTIMATE, choose_injection
 from airl_mav.profiles.computer import ComputerProfile, Latency
 from airl_mav.profiles.published import load_published
+from airl_mav.sweep.config import SweepConfig
 from airl_mav.sweep.store import SCHEMA, SWEEP_FILE, SweepFolder, as_data
 from airl_mav.sweep.trial import Trial, TrialResult, size_of, trials
 
@@ -72,8 +73,10 @@ class Sweep:
     computer: Computer | None
     cells: tuple[NetworkSummary, ...]
 
-    config = property(lambda self: self.folder.config)
-    """What was asked for."""
+    @property
+    def config(self) -> SweepConfig:
+        """What was asked for."""
+        return self.folder.config
 
     @property
     def arenas(self) -> tuple[str, ...]:

@@ -189,8 +189,10 @@ class CompanionTap:
         """A flight begins."""
         self._hand = self._new_hand()
 
-    touched = property(lambda self: self._hand.touched)
-    """Whether the watchers have changed the latency or the compensation of this flight."""
+    @property
+    def touched(self) -> bool:
+        """Whether the watchers have changed the latency or the compensation of this flight."""
+        return self._hand.touched
 
     def latency(self, sampler: LatencySampler | None) -> LatencySampler:
         """Return a latency that the watchers may set, instead of the scenario's."""

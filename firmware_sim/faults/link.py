@@ -114,7 +114,7 @@ class FailingSender:
     """Sender to one peer over a failing link. Implements `endpoint.Endpoint`."""
 
     def __init__(self, endpoint: Endpoint, clock: Clock, *, conducted: bool) -> None:
-        """Take what sends over a healthy link. The rest as of `FailingEndpoint`."""
+        """Take the sender of a healthy link. Other arguments: as `FailingEndpoint`."""
         self.datagrams = endpoint.datagrams
         self.lane: Lane[bytes] = Lane()
         """Towards the peer."""

@@ -1,4 +1,4 @@
-"""Faults of an episode that act now, and that have acted. Those of clients among them."""
+"""Faults of an episode that act now or have acted. Clients may add some."""
 
 from __future__ import annotations
 

@@ -110,8 +110,10 @@ class ComparedRun:
     published: PublishedRun | None = None
     """The same column of a publication, if it has one."""
 
-    name = property(lambda self: self.entry.name)
-    """Name of the run in the comparison."""
+    @property
+    def name(self) -> str:
+        """Name of the run in the comparison."""
+        return self.entry.name
 
     @property
     def label(self) -> str:
@@ -153,10 +155,15 @@ class Contrast:
     published: PublishedGap | None = None
     """The same difference of a publication's columns, if it has both of them."""
 
-    pairs = property(lambda self: self.paired.agreement.n)
-    """Number of flights of the same episode."""
-    successes = property(lambda self: self.paired.flight_time_s.difference.n)
-    """Number of pairs of which both reached the goal."""
+    @property
+    def pairs(self) -> int:
+        """Number of flights of the same episode."""
+        return self.paired.agreement.n
+
+    @property
+    def successes(self) -> int:
+        """Number of pairs of which both reached the goal."""
+        return self.paired.flight_time_s.difference.n
 
 
 @dataclass(frozen=True)

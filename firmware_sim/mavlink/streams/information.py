@@ -1,4 +1,4 @@
-"""The flight so far and the way home. The protocol's version, on request."""
+"""The flight so far and the way home; the protocol's version on request."""
 
 from __future__ import annotations
 
