@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from airl_mav.core.constants import TICK_US
 from airl_mav.core.frames import Vector
 from airl_mav.flight.trajectory import TrajectoryRecorder
 from airl_mav.latency.stamps import NO_STAMP
@@ -53,13 +54,14 @@ class SetpointLog:
         self.under_way.append((self._taken, len(self._accepted), ticks_to_motors))
         self._taken = len(self._accepted)
 
-    def flown(self, times_us: Sequence[int]) -> None:
-        """Note when motor commands were computed in the newest ticks (n,) [µs]."""
-        for first, end, ticks in self.under_way:
-            if ticks < len(times_us):
-                self._motor_us[first:end] = [times_us[max(0, ticks)]] * (end - first)
-        left = ((first, end, ticks - len(times_us)) for first, end, ticks in self.under_way)
-        self.under_way = [entry for entry in left if entry[2] >= 0]
+    def flown(self, first_us: int, n: int) -> None:
+        """Note that the motor commands of the newest n ticks were computed from `first_us` on."""
+        entries, self.under_way = self.under_way, []
+        for first, end, ticks in entries:
+            if ticks < n:
+                self._motor_us[first:end] = [first_us + max(0, ticks) * TICK_US] * (end - first)
+            else:
+                self.under_way.append((first, end, ticks - n))
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return accepted_us (n,), motor_us (n,), setpoint float32 (n, 4)."""
@@ -112,7 +114,7 @@ class FlightRecorder:
         """Forget the path so far: the episode begins now."""
         self._trajectory = TrajectoryRecorder()
         self._estimates: list[Vector] = []
-        """Position, velocity, attitude (10,) as old as the samples of the trajectory, less one
+        """Position, velocity, attitude, blocks (m, 10), as old as the samples of the trajectory, less one
         tick: what the motors were told by."""
         self._estimated_us: list[int] = []
         self._lateness_us: list[int] = []
@@ -132,21 +134,18 @@ class FlightRecorder:
         if self._internals is not None and self.setpoints.fresh:
             self.setpoints.take(self._internals.ticks_to_motors + ticks)
 
-    def flown(self, truths: Record, flown: Record, first_us: int) -> None:
-        """Take the newest ticks.
+    def flown(self, truths: Record, flown: Record) -> None:
+        """Take ticks.
 
         Args:
             truths: (n,) log of the aircraft.
-            flown: (n,) log of the flight controller; empty = nobody can look into it.
-            first_us: When the first of them had its motor commands [µs].
+            flown: (n,) log of the flight controller; nothing is in it for external firmware.
         """
-        times = truths["time_us"].tolist()
-        if self.setpoints.under_way:
-            self.setpoints.flown([first_us + time_us - times[0] for time_us in times])
-        for k in self._trajectory.extend(times, truths["power_w"].tolist(), truths["motion"]):
-            if self._internals is not None:
-                self._estimates.append(flown["state"][k, :RATES].copy())
-                self._estimated_us.append(flown["time_us"].item(k))
+        times, powers_w = truths["time_us"].tolist(), truths["power_w"].tolist()
+        kept = self._trajectory.extend(times, powers_w, truths["motion"])
+        if self._internals is not None:
+            self._estimates.append(flown["state"][kept, :RATES])
+            self._estimated_us += flown["time_us"][kept].tolist()
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return what was recorded so far, by the names of its file (docs/run-folder.md)."""
@@ -160,7 +159,7 @@ class FlightRecorder:
             return arrays
         for name, values in self.setpoints.arrays().items():
             arrays[f"setpoints/{name}"] = values
-        estimates = np.array(self._estimates).reshape(-1, RATES)
+        estimates = np.concatenate([np.zeros((0, RATES)), *self._estimates])
         return arrays | {
             "estimate/time_us": np.array(self._estimated_us, np.int64),
             "estimate/position": estimates[:, P:V],

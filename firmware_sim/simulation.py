@@ -49,6 +49,9 @@ from firmware_sim.simulation_snapshot import SimulationSnapshot
 MOST_TICKS = US_PER_S // TICK_US
 """Maximum number of ticks that are flown at once."""
 
+LOG_TICKS = 2 * MOST_TICKS
+"""Ticks in the logs. What they hold is recorded when there is no room for more."""
+
 _ENDS = (COLLIDED, ALIGN, HEALTH, EMPTY)
 """Events that end a stretch whatever follows from them."""
 
@@ -160,8 +163,10 @@ class Simulation:
         """Simulated time of the newest sample."""
         self.is_flying = False
         """Whether `advance` is under way."""
-        self._truths = np.zeros(MOST_TICKS, TRUE_TICK)
-        self._flown = np.zeros(MOST_TICKS, FLOWN_TICK)
+        self._truths = np.zeros(LOG_TICKS, TRUE_TICK)
+        self._flown = np.zeros(LOG_TICKS, FLOWN_TICK)
+        self._logged = self._recorded = 0
+        """Ticks that are in the logs, and how many of them the recorder has taken."""
         self.truths = self._truths[:0]
         """Log of the aircraft in the newest ticks (`engine.record.TRUE_TICK`)."""
         self.flown = self._flown[:0]
@@ -173,6 +178,7 @@ class Simulation:
     def begin(self) -> None:
         """Say that the episode begins now: what was flown and recorded so far is no part of it."""
         self.start_us = self.time_us
+        self._recorded = self._logged
         if self.recorder is not None:
             self.recorder.begin()
         self.plant.begin()
@@ -210,6 +216,9 @@ class Simulation:
         """
         plant, recorder, autopilot = self.plant, self.recorder, self.autopilot.internals
         first_us, self.is_flying = self._clock.time_us(), True
+        if self._logged > LOG_TICKS - MOST_TICKS:
+            self._record()
+            self._logged = self._recorded = 0
         if recorder is None:
             plant.collisions.clear()
         else:
@@ -219,10 +228,20 @@ class Simulation:
         else:
             done = self._stretch(autopilot, until_us, arrivals)
         self.time_us, self.is_flying = plant.time_us, False
-        self.truths = self._truths[:done]
-        self.flown = self._flown[: 0 if autopilot is None else done]
-        if recorder is not None:
-            recorder.flown(self.truths, self.flown, first_us)
+        first, self._logged = self._logged, self._logged + done
+        self.truths = self._truths[first : self._logged]
+        self.flown = self._flown[first : first if autopilot is None else self._logged]
+        if recorder is None:
+            self._recorded = self._logged
+        elif recorder.setpoints.under_way:
+            recorder.setpoints.flown(first_us, done)
+
+    def _record(self) -> None:
+        """Let the recorder take what it has not taken yet of the logs."""
+        new = slice(self._recorded, self._logged)
+        if self.recorder is not None:
+            self.recorder.flown(self._truths[new], self._flown[new])
+        self._recorded = self._logged
 
     def _is_compiled(self, autopilot: BuiltinAutopilot) -> bool:
         """Return whether compiled ticks fly as Python's do: no fault, no sensor beyond GPS."""
@@ -232,10 +251,11 @@ class Simulation:
         """Fly a tick whose sample or commands are not the engine's; return 1."""
         before = self.plant.newest() if self._sample is None else self._sample
         self._sample = sample = self.plant.step(self._fly(before))
-        log_record(self.plant.record, self._truths)
+        truths, flown = self._truths[self._logged :], self._flown[self._logged :]
+        log_record(self.plant.record, truths)
         if autopilot is not None:
-            log_flown_record(autopilot.record, self._flown)
-            self._flown["battery"][0] = sample.battery
+            log_flown_record(autopilot.record, flown)
+            flown["battery"][0] = sample.battery
             if self._fly is self._unaltered:
                 autopilot.take(sample)  # as compiled ticks do
         return 1
@@ -272,6 +292,7 @@ class Simulation:
     def _glide(self, autopilot: BuiltinAutopilot, first: int, end: int) -> tuple[int, int]:
         """Fly ticks at a constant demand into the logs; return how many, and the last event."""
         plant, record = self.plant, autopilot.record
+        first, end = self._logged + first, self._logged + end
         flown, event = plant.glide(
             record, end - first, self._truths[first:end], self._flown[first:end]
         )
@@ -303,6 +324,7 @@ class Simulation:
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return what was recorded so far, by the names of its file (docs/run-folder.md)."""
+        self._record()
         if self.recorder is None:
             return {}
         acted = [] if self.faults is None else self.faults.acted(self.time_us)

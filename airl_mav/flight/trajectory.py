@@ -106,6 +106,7 @@ class TrajectoryRecorder:
     def __init__(self) -> None:
         self._times: list[int] = []
         self._states: list[NDArray[np.float64]] = []
+        """Blocks (m, 10) of samples."""
         self._powers: list[float] = []
         self._last_us: int | None = None
         self._kept_us = 0
@@ -117,14 +118,19 @@ class TrajectoryRecorder:
         self, times_us: Sequence[int], powers_w: Sequence[float], states: NDArray[np.float64]
     ) -> list[int]:
         """Take n ticks with states (n, >= 10); return which of them were sampled."""
-        kept = []
+        kept, last_us, power_w = [], self._last_us, self._power_w
         for k, (time_us, power_w) in enumerate(zip(times_us, powers_w, strict=True)):
-            last_us, self._last_us, self._power_w = self._last_us, time_us, power_w
             if last_us is not None:
                 self._energy_uj += power_w * (time_us - last_us)
-            if time_us - self._kept_us >= SAMPLE_US or not self._times:
-                self.keep(states[k, :10].copy())
+            last_us = time_us
+            passed_us = time_us - self._kept_us
+            if passed_us >= SAMPLE_US or not self._times:
+                self._powers.append(self._energy_uj / passed_us if self._times else power_w)
+                self._times.append(time_us)
+                self._kept_us, self._energy_uj = time_us, 0.0
                 kept.append(k)
+        self._last_us, self._power_w = last_us, power_w
+        self._states.append(states[kept, :10])
         return kept
 
     def keep(self, state: NDArray[np.float64]) -> None:
@@ -140,12 +146,12 @@ class TrajectoryRecorder:
         passed_us = time_us - self._kept_us
         self._powers.append(self._power_w if first else self._energy_uj / passed_us)
         self._times.append(time_us)
-        self._states.append(state)
+        self._states.append(state[None])
         self._kept_us, self._energy_uj = time_us, 0.0
 
     def trajectory(self) -> Trajectory:
         """Return what was recorded so far."""
-        rows = np.array(self._states, np.float64).reshape(-1, 10)
+        rows = np.concatenate([np.zeros((0, 10)), *self._states])
         return Trajectory(
             np.array(self._times, np.int64),
             rows[:, :3],

@@ -33,7 +33,7 @@ from firmware_sim.autopilot.error_filter import NewFilter
 from firmware_sim.autopilot.estimator import Estimator
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.events.definition import Event as Told
-from firmware_sim.autopilot.failsafes.framework import Intervention
+from firmware_sim.autopilot.failsafes.framework import NO_INTERVENTION, Intervention
 from firmware_sim.autopilot.failsafes.supervisor import Supervisor
 from firmware_sim.autopilot.filter_kernel import KernelFilter
 from firmware_sim.autopilot.flight_commander import Commanded, FlightCommander
@@ -118,6 +118,8 @@ class BuiltinAutopilot:
         """The commander's state and the setpoint that the newest decision is of."""
         self._decided_healthy = 0
         """Whether the estimator was healthy then, 0 or 1."""
+        self._is_settled = False
+        """Whether its demand stays the same in the air until something changes."""
         self._told: tuple[object, ...] = ()
         self._unsaid = 0
         """What clients could see at the newest decision, and how many texts and events waited."""
@@ -229,17 +231,35 @@ class BuiltinAutopilot:
     def decide_if_due(self) -> int:
         """Decide where something is due or has arrived; return when to ask again [µs]."""
         flight, setpoint = self._decided_on
-        if (
-            self._taken_us >= self._due_us
-            or flight is not self._commander.flight
+        changed = (
+            flight is not self._commander.flight
             or self._decided_healthy != self.record["healthy"].item(0)
             or setpoint is not self._guidance.context.setpoint
-            or self._taken_us >= min(self.supervisor.next_us, self._navigator.due_us)
-        ):
+        )
+        due_us = min(self._due_us, self.supervisor.next_us, self._navigator.due_us)
+        if changed or (self._taken_us >= due_us and not self._finds_nothing_new()):
             self.decide()
             self._prepare()
             self._has_news = self._look_for_news()
         return self._taken_us if self._has_news else self._due_us
+
+    def _finds_nothing_new(self) -> bool:
+        """Return whether a look of the failsafes is all that is due, and changes nothing."""
+        supervisor, flight = self.supervisor, self._commander.flight
+        said = len(self._messages) + len(self._events) > self._unsaid
+        if said or not (self._is_settled and self._is_idle()):
+            return False
+        if self._guidance.is_done(self._state):
+            return False
+        if not supervisor.is_unchanged(self._taken_us, flight):
+            return False
+        self._commander.obey(NO_INTERVENTION)
+        if self._commander.flight is not flight:
+            self._navigator.due_us = 0
+            return False
+        self._navigator.due_us = self._taken_us + IDLE_US
+        self._due_us = min(supervisor.next_us, self._navigator.due_us)
+        return True
 
     def _look_for_news(self) -> bool:
         """Return whether clients are to be told of the newest decision."""
@@ -247,10 +267,13 @@ class BuiltinAutopilot:
         told = (
             *(self._commander.flight, self._guidance.destination, self._home.place),
             *(self.estimator.origin, self.supervisor.changes, plans.current, plans.reached),
+            self.parameters.revision,
         )
-        news = told != self._told or waiting > self._unsaid
-        self._told, self._unsaid = told, waiting
-        return news
+        news = told != self._told
+        if news:
+            self._told = told
+        said, self._unsaid = waiting > self._unsaid, waiting
+        return news or said
 
     def _prepare(self) -> None:
         """Prepare the record for compiled ticks, and say when to decide again."""
@@ -262,7 +285,9 @@ class BuiltinAutopilot:
             LANDING if phase is _AIR else LIFT_OFF if phase is _GROUND else NOTHING
         )
         self._due_us = min(self.supervisor.next_us, self._navigator.due_us)
-        if not self._guidance.is_steady(phase) or self._manual_control.was_heard:
+        steady = self._guidance.is_steady(phase) and not self._manual_control.was_heard
+        self._is_settled = steady and phase is _AIR
+        if not steady:
             self._due_us = min(self._due_us, self._taken_us + DECIDE_US)
 
     def fuse(self, sample: SensorSample, left: int) -> None:
@@ -300,15 +325,22 @@ class BuiltinAutopilot:
         armed = flight.phase >= _GROUND
         if not armed:
             self._home.stands()
-        on = flight, self._home.place, self.plans.changes, self.parameters.revision
-        if on == self._navigated_on and navigator.idle:
+        if self._is_idle():
             navigator.due_us = self._taken_us + IDLE_US
             return
         situation = self._situation()
         if situation is not None:
-            self._navigated_on = on
+            self._navigated_on = self._navigates_on()
             navigator.step(situation, flight.mode, self._whereabouts.fenced_place, armed=armed)
             navigator.tell(self._guidance.context, self.supervisor.watch.reports)
+
+    def _navigates_on(self) -> tuple[object, ...]:
+        changes = self.plans.changes, self.parameters.revision
+        return self._commander.flight, self._home.place, *changes
+
+    def _is_idle(self) -> bool:
+        """Return whether the navigator has nothing to do, as at its newest step."""
+        return self._navigator.idle and self._navigates_on() == self._navigated_on
 
     def _return_place(self) -> Place | None:
         """Return where Return goes: home, or what RTL_TYPE prefers."""
@@ -578,5 +610,7 @@ class BuiltinAutopilot:
             return self._snapshot
         if self._taken_us < 0:
             raise RuntimeError("no tick yet: the autopilot has no state")
-        self._snapshot = Snapshot(self._parts, self._taken_us, self._demand)
+        calm = self.supervisor.is_calm and self._newest.esc_outputs is None
+        settled = self._told if calm else None
+        self._snapshot = Snapshot(self._parts, self._taken_us, self._demand, settled)
         return self._snapshot

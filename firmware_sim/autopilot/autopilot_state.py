@@ -289,6 +289,11 @@ class AutopilotState(Protocol):
         ...
 
     @property
+    def settled(self) -> object:
+        """The same object as long as nothing has changed that a tick's log lacks; None = it may."""
+        ...
+
+    @property
     def estimate(self) -> Estimate:
         """The estimator's output."""
         ...

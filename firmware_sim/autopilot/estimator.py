@@ -213,6 +213,7 @@ class Estimator:
             sample.gyro,
         )
         record["temperature_c"] = sample.temperature_c
+        record["battery_left"] = sample.battery.remaining
         if sample.mag is not None:
             record["mag"] = sample.mag
         if sample.pressure_hpa is not None:

@@ -65,9 +65,10 @@ class FlightCommander:
 
     def look(self) -> None:
         """Let the failsafes look, and do what they decide."""
-        sample = self._newest.sample
-        if sample is not None:
-            for text in self._commanded.supervisor.look(sample, self.flight):
+        supervisor = self._commanded.supervisor
+        if not supervisor.is_unchanged(self._now_us, self.flight):
+            sample = self._newest.sample
+            for text in [] if sample is None else supervisor.look(sample, self.flight):
                 self._say(text)
         self.obey(NO_INTERVENTION)
 

@@ -100,7 +100,8 @@ class SensorWatch:
     def __init__(self, kind: SensorKind, times: NDArray[np.int64]) -> None:
         """Begin without a sample; `times` (3,) is its row of `watch` (`engine.record`)."""
         self.kind = kind
-        self._value: Any = None
+        self.value: Any = None
+        """The newest sample's."""
         self._times = times
         self.noisy: bool | None = None
         """Whether its samples differ at rest, too; None = not known yet."""
@@ -112,13 +113,13 @@ class SensorWatch:
     def take(self, sample: SensorSample) -> None:
         """Take a sample in which it has measured."""
         value, now_us = self.kind.read(sample), sample.time_us
-        self.repeats = value == self._value
+        self.repeats = value == self.value
         times = self._times
         times[SEEN] = now_us
         if self.repeats:
             self.noisy = self.noisy or False
             return
-        self._value, times[CHANGED] = value, now_us
+        self.value, times[CHANGED] = value, now_us
         if times[FIRST] < 0:
             times[FIRST] = now_us
 
@@ -175,6 +176,10 @@ class SensorMonitor:
         """Whether `trusted` leaves something out of the newest sample."""
         self._flying = False
 
+    def looked_at(self, accel: NDArray[np.float64], gyro: NDArray[np.float64]) -> None:
+        """Take what the inertial sensors measured at the newest look."""
+        self.accel.value, self.gyro.value = tuple(accel.tolist()), tuple(gyro.tolist())
+
     def take(self, sample: SensorSample) -> None:
         """Take a tick's sample: which of the slower sensors have measured."""
         self.distrusted = False
@@ -224,6 +229,11 @@ class SensorMonitor:
             if text is not None:
                 texts.append(text)
         return texts
+
+    def are_calm(self, now_us: int) -> bool:
+        """Return whether each of them has lately measured something new."""
+        times = zip(self.all, self._times[:, CHANGED].tolist(), strict=True)
+        return all(w.noisy and not w.failed and now_us - us < CALM_US for w, us in times)
 
     def valid(self, now_us: int) -> Valid:
         """Return which sensors have measured lately, and not only repeated themselves."""

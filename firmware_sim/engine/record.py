@@ -117,6 +117,7 @@ SAMPLE = np.dtype(
         ("gps_position", _F, 3),  # NED [m]
         ("gps_velocity", _F, 3),
         ("gps_epv_m", _F),
+        ("battery_left", _F),  # 0..1
     ],
     align=True,
 )
@@ -134,7 +135,9 @@ CONTROLLER = np.dtype(
         ("temperature_c", _F),
         ("gps_position", _F, 3),
         ("gps_velocity", _F, 3),
+        ("battery_left", _F),
         ("watch", _I, (WATCHES, 3)),
+        ("looked_at", _F, 6),  # accelerometer and gyro at the newest look of the failsafes
         # Alignment at rest: sums of accelerometer, compass, barometric altitude, fix.
         ("aligned", _I),
         ("rest_since_us", _I),  # -1 = no sample yet

@@ -405,7 +405,7 @@ def sense(
         a.gyro_bias[i] += sigma[9 + i] * white[9 + i]
         sample.accel[i] = felt[i] + a.accel_bias[i] + sigma[i] * white[i]
         sample.gyro[i] = turning[i] + a.gyro_bias[i] + sigma[3 + i] * white[3 + i]
-    sample.time_us, sample.measured = now_us, 0
+    sample.time_us, sample.measured, sample.battery_left = now_us, 0, a.battery[3]
     sample.temperature_c = atmosphere.temperature_c(_HOME_M - row[2])
     if is_due(a.mag_rate, now_us):
         white = compass[a.noise_at[_COMPASS]]
@@ -464,6 +464,15 @@ def _copied(new: Vector, old: Vector) -> bool:
         changed = changed or new[i] != old[i]
         old[i] = new[i]
     return changed
+
+
+@kernel
+def _take_inertial(c: Fields, sample: Fields) -> None:
+    """Take what is measured at every tick."""
+    c.time_us, c.temperature_c = sample.time_us, sample.temperature_c
+    c.battery_left = sample.battery_left
+    for i in range(3):
+        c.accel[i], c.gyro[i] = sample.accel[i], sample.gyro[i]
 
 
 @kernel
@@ -567,9 +576,7 @@ def fuse_heading(c: Fields) -> bool:
 @kernel
 def _await_alignment(c: Fields, sample: Fields) -> bool:
     """Add a sample at rest to the sums; return whether Python has to look at them."""
-    c.time_us, c.temperature_c = sample.time_us, sample.temperature_c
-    for i in range(3):
-        c.accel[i], c.gyro[i] = sample.accel[i], sample.gyro[i]
+    _take_inertial(c, sample)
     _take(c, sample)
     add(c, sample.measured)
     first_fix = sample.measured & GPS != 0 and c.rest_count[FIXES] == 1
@@ -587,9 +594,7 @@ def estimate(c: Fields, sample: Fields) -> int:
     Returns:
         What is left for Python to fuse: bits of `measured`, and those of repeated samples.
     """
-    c.time_us, c.temperature_c = sample.time_us, sample.temperature_c
-    for i in range(3):
-        c.accel[i], c.gyro[i] = sample.accel[i], sample.gyro[i]
+    _take_inertial(c, sample)
     predict(c.state, c.covariance, c.process_noise, c.transition, c.gyro, c.accel, TICK_S)
     feel(c)
     if sample.measured == 0:

@@ -154,6 +154,11 @@ class HealthReporter:
         self._told: HealthReport | None = None
         self._told_us = 0
 
+    @property
+    def is_told(self) -> bool:
+        """Whether the newest report is the one that was told."""
+        return self._report == self._told
+
     def update(self, readiness: Readiness, now_us: int, *, force: bool = False) -> None:
         """Look at what the checks look at; tell at most every `REPORT_US`, unless forced."""
         if readiness != self._seen or self._report is None:

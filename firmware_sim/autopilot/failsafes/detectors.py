@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from airl_mav.core.constants import US_PER_S
+from airl_mav.core.kernels import kernel
 from airl_mav.core.frames import Vector
 from firmware_sim.autopilot.error_state import Q
 
@@ -40,16 +41,23 @@ class Lasting:
     """Whether something has been so for some time."""
 
     def __init__(self) -> None:
-        self._since_us: int | None = None
+        self.since_us: int | None = None
 
     def update(self, now_us: int, seconds: float, *, true: bool) -> bool:
         """Return whether it is true now and has been at every update for `seconds`."""
         if not true:
-            self._since_us = None
+            self.since_us = None
             return False
-        if self._since_us is None:
-            self._since_us = now_us
-        return now_us - self._since_us >= seconds * US_PER_S
+        if self.since_us is None:
+            self.since_us = now_us
+        return now_us - self.since_us >= seconds * US_PER_S
+
+
+@kernel
+def roll_and_pitch(w: float, x: float, y: float, z: float) -> tuple[float, float]:
+    """Return the magnitudes of both angles of an attitude [rad]."""
+    roll = abs(math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)))
+    return roll, abs(math.asin(max(-1.0, min(1.0, 2.0 * (w * y - z * x)))))
 
 
 class AttitudeFailure:
@@ -62,6 +70,11 @@ class AttitudeFailure:
         self._roll, self._pitch = Lasting(), Lasting()
         self.roll = self.pitch = False
 
+    @property
+    def is_calm(self) -> bool:
+        """Whether both angles were within their limits at the newest update."""
+        return self._roll.since_us is None and self._pitch.since_us is None
+
     def update(
         self,
         now_us: int,
@@ -70,9 +83,7 @@ class AttitudeFailure:
         lasting_s: tuple[float, float],
     ) -> bool:
         """Return whether roll or pitch of the nominal state is out of limits [deg], 0 = none."""
-        w, x, y, z = state[Q : Q + 4].tolist()
-        roll = abs(math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)))
-        pitch = abs(math.asin(max(-1.0, min(1.0, 2.0 * (w * y - z * x)))))
+        roll, pitch = roll_and_pitch(*state[Q : Q + 4].tolist())
         roll_max, pitch_max = math.radians(abs(limits_deg[0])), math.radians(abs(limits_deg[1]))
         self.roll = self._roll.update(now_us, lasting_s[0], true=0.0 < roll_max < roll)
         self.pitch = self._pitch.update(now_us, lasting_s[1], true=0.0 < pitch_max < pitch)

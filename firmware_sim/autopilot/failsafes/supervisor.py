@@ -93,6 +93,8 @@ class Supervisor:
         self._check_us = 0
         self._checked = Phase.BOOT
         """Phase of the flight that was checked last."""
+        self._calm_flight: Flight | None = None
+        """State at a look that found nothing new; None = it did, or the next one might."""
         self.read_parameters()
 
     def read_parameters(self) -> None:
@@ -100,7 +102,7 @@ class Supervisor:
         self.watch.read_parameters()
         self._settings = Settings.read(self._value)
         self._arming = ArmingSettings.read(self._value)
-        self.next_us = 0
+        self.next_us, self._calm_flight = 0, None
 
     # --- what is heard
 
@@ -118,9 +120,22 @@ class Supervisor:
 
     def tell_checks(self) -> None:
         """Tell all failing checks at the next look, also those that were told before."""
-        self._asked, self.next_us, self._check_us = True, 0, 0
+        self._asked, self.next_us, self._check_us, self._calm_flight = True, 0, 0, None
 
     # --- looking
+
+    @property
+    def is_calm(self) -> bool:
+        """Whether the newest look found nothing new or unusual."""
+        return self._calm_flight is not None
+
+    def is_unchanged(self, now_us: int, flight: Flight) -> bool:
+        """Return whether a look finds what the newest one found; then it counts as one."""
+        if flight is not self._calm_flight or not self.watch.is_unchanged(now_us):
+            self._calm_flight = None
+            return False
+        self.next_us, self._check_us = now_us + LOOK_US, now_us + CHECK_US
+        return True
 
     def look(self, sample: SensorSample, flight: Flight) -> list[Message]:
         """Find out what is wrong; return what the operator is told of it."""
@@ -139,6 +154,9 @@ class Supervisor:
                 self._armable = not prearm.blocking(self.failing, readiness)
             self._reporter.update(readiness, now_us, force=self._asked)
             texts += self._report(now_us, flight)
+        told = self.failing == self._told and not self._asked and self._reporter.is_told
+        calm = told and not changed and self.watch.is_calm
+        self._calm_flight = flight if calm else None
         return texts
 
     def _tell_of_pilot(self, now_us: int, *, was_lost: bool) -> None:

@@ -7,11 +7,16 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
+
 from airl_mav.control.mixer import Motors
 from airl_mav.core.constants import US_PER_S
+from airl_mav.core.frames import Vector
+from airl_mav.core.kernels import kernel
 from firmware_sim.autopilot.autopilot_state import Message, Setpoint, Severity
 from firmware_sim.autopilot.commander import Phase
-from firmware_sim.autopilot.estimator import Estimator
+from firmware_sim.autopilot.error_state import SIGMA, Q
+from firmware_sim.autopilot.estimator import GPS_GONE_US, Estimator
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.failsafes.conditions import (
     NO_BREACH,
@@ -19,14 +24,67 @@ from firmware_sim.autopilot.failsafes.conditions import (
     Conditions,
     FenceBreach,
 )
-from firmware_sim.autopilot.failsafes.detectors import AttitudeFailure, Validity
+from firmware_sim.autopilot.failsafes.detectors import (
+    HYSTERESIS,
+    AttitudeFailure,
+    Validity,
+    roll_and_pitch,
+)
 from firmware_sim.autopilot.failsafes.endurance import Endurance
 from firmware_sim.autopilot.failsafes.motor_failure import MotorFailure, Undercurrent
-from firmware_sim.autopilot.sensor_monitor import SensorMonitor
+from firmware_sim.autopilot.sensor_monitor import CALM_US, SensorMonitor
+from firmware_sim.engine.record import (
+    ACCEL_ROW,
+    CHANGED,
+    GYRO_ROW,
+    MAG_ROW,
+    SEEN,
+    WATCHES,
+    Record,
+)
 from firmware_sim.interfaces import BatterySample, SensorSample
 
 _GROUND, _AIR = Phase.GROUND, Phase.AIR
 _WARNINGS = tuple(BatteryWarning)
+
+_RECENT, _ACCURACY, _SPEED_ACCURACY, _ROLL, _PITCH, _BATTERY = range(6)
+"""Places in the limits of `is_calm`."""
+
+
+@kernel
+def is_calm(controller: Record, limits: Vector) -> bool:
+    """Return whether all that is measured is far from what failsafes look for; note that look.
+
+    Args:
+        controller: Record (1,); `looked_at` and `watch` are updated in a calm look.
+        limits: (6,) age of the newest fusion [µs], accuracies [m], [m/s], angles [rad], charge.
+    """
+    c = controller[0]
+    now_us, s, seen = c.time_us, c.state, c.looked_at
+    fused_us = min(c.gps_horizontal_us, c.baro_fused_us)
+    roll, pitch = roll_and_pitch(s[Q], s[Q + 1], s[Q + 2], s[Q + 3])
+    calm = (
+        c.healthy != 0
+        and fused_us >= 0
+        and now_us - fused_us <= limits[_RECENT]
+        and math.hypot(s[SIGMA], s[SIGMA + 1]) < limits[_ACCURACY]
+        and math.hypot(s[SIGMA + 3], s[SIGMA + 4]) < limits[_SPEED_ACCURACY]
+        and roll <= limits[_ROLL]
+        and pitch <= limits[_PITCH]
+        and c.battery_left >= limits[_BATTERY]
+    )
+    for row in range(MAG_ROW, WATCHES):
+        calm = calm and now_us - c.watch[row, CHANGED] < CALM_US
+    felt = turned = False
+    for i in range(3):
+        felt, turned = felt or c.accel[i] != seen[i], turned or c.gyro[i] != seen[3 + i]
+    if not (calm and felt and turned):
+        return False
+    for i in range(3):
+        seen[i], seen[3 + i] = c.accel[i], c.gyro[i]
+    for row in (GYRO_ROW, ACCEL_ROW):
+        c.watch[row, SEEN] = c.watch[row, CHANGED] = now_us
+    return True
 
 
 @dataclass
@@ -53,6 +111,7 @@ class WatchSettings(NamedTuple):
     bat_low_thr: float = 0.15
     bat_crit_thr: float = 0.07
     bat_emergen_thr: float = 0.05
+    com_arm_bat_min: float = -1.0
     com_dl_loss_t: float = 10.0
     com_flt_time_max: float = -1.0
     com_of_loss_t: float = 1.0
@@ -82,7 +141,6 @@ class Watch:
         """Take a lookup of PX4 parameter names, and the estimator whose outputs are judged."""
         self._value = value
         self._estimator = estimator
-        self.settings = WatchSettings.read(value)
         self.sensors = SensorMonitor(estimator.record["watch"][0])
         """The sensors, watched."""
         self.attitude = AttitudeFailure()
@@ -104,10 +162,24 @@ class Watch:
         self._vision_fused = False
         self._restarts = 0
         self._compass_given_up = False
+        self._calm: tuple[object, ...] | None = None
+        """What was reported and heard at a look that found nothing unusual; None = it did."""
+        self.read_parameters()
 
     def read_parameters(self) -> None:
         """Read the parameters anew."""
-        self.settings = WatchSettings.read(self._value)
+        self.settings = p = WatchSettings.read(self._value)
+        self._calm = None
+        tilts = (math.radians(abs(d)) or math.inf for d in (p.fd_fail_r, p.fd_fail_p))
+        self._limits = np.array(
+            [
+                min(self._value("EKF2_NOAID_TOUT"), GPS_GONE_US),
+                HYSTERESIS * (p.com_pos_fs_eph if p.com_pos_fs_eph >= 0.0 else math.inf),
+                HYSTERESIS * p.com_vel_fs_evh,
+                *tilts,
+                max(p.bat_low_thr, p.bat_crit_thr, p.bat_emergen_thr, p.com_arm_bat_min),
+            ]
+        )
 
     def hear_setpoint(self, setpoint: Setpoint | None, time_us: int) -> None:
         """Note a valid offboard setpoint; None = one of attitude or body rates."""
@@ -142,10 +214,57 @@ class Watch:
 
     def look(self, sample: SensorSample, phase: Phase) -> tuple[Conditions, list[Message]]:
         """Return what is wrong now, and what has changed that an operator is told at once."""
+        seen, now_us = self._estimator.record["looked_at"][0], sample.time_us
+        if self._calm is not None:
+            self.sensors.looked_at(seen[:3], seen[3:])
         texts = self.sensors.judge(sample, flying=phase is _AIR)
         conditions = self._conditions(sample, phase)
-        texts += self._texts(conditions, sample.time_us, phase)
+        texts += self._texts(conditions, now_us, phase)
+        seen[:3], seen[3:] = sample.accel, sample.gyro
+        usual = phase >= _GROUND and self._is_usual(conditions, now_us)
+        self._calm = self._reported(now_us) if usual else None
         return conditions, texts
+
+    @property
+    def is_calm(self) -> bool:
+        """Whether the newest look found nothing unusual."""
+        return self._calm is not None
+
+    def is_unchanged(self, now_us: int) -> bool:
+        """Return whether a look would find what the newest one found."""
+        calm = self._calm
+        if calm is None or self._reported(now_us) != calm:
+            return False
+        return is_calm(self._estimator.record, self._limits)
+
+    def _reported(self, now_us: int) -> tuple[object, ...]:
+        reports, recovery, p = self.reports, self._estimator.recovery, self.settings
+        return (
+            _silent(self._setpoint_us, now_us, p.com_of_loss_t),
+            _silent(self._manual_us, now_us, p.com_rc_loss_t),
+            _silent(self._gcs_us, now_us, p.com_dl_loss_t),
+            *(reports.fence, reports.mission_missing, reports.mission_failure),
+            *(reports.navigator_failure, self.motors.failed, recovery.compass.given_up),
+            *(recovery.consistency.restarts, self._estimator.compiled),
+        )
+
+    def _is_usual(self, found: Conditions, now_us: int) -> bool:
+        """Return whether nothing is under way that time alone, or a look, would change."""
+        p = self.settings
+        return (
+            max(p.com_flt_time_max, p.com_pos_low_eph, p.bat1_capacity) <= 0.0
+            and self._local.valid
+            and self._relaxed.valid
+            and self._velocity.valid
+            and not (found.global_position_invalid or found.local_altitude_invalid)
+            and not (found.battery_warning or self._vision_fused)
+            and self._gps_fused
+            and found.manual_control_signal_lost
+            and self._estimator.compiled
+            and self.attitude.is_calm
+            and not self._estimator.recovery.doubts_inertial(now_us)
+            and self.sensors.are_calm(now_us)
+        )
 
     def _conditions(self, sample: SensorSample, phase: Phase) -> Conditions:
         now_us, p, reports = sample.time_us, self.settings, self.reports
