@@ -282,7 +282,7 @@ class Simulation:
             done += flown
             # Texts of a landing have the time of the tick in which it is detected.
             self.time_us += (flown - 1) * TICK_US
-            changed = autopilot.flown(plant.newest)
+            changed = autopilot.flown(plant.newest, event)
             self.time_us += TICK_US
             # After what Python fuses, other aids may be in use.
             if changed or event in _ENDS or (event == FUSE and not autopilot.compiled):

@@ -21,6 +21,7 @@ from firmware_sim.autopilot.autopilot_state import (
     Severity,
     Wire,
 )
+from firmware_sim.autopilot.climb import DECIDE_US, climb_record
 from firmware_sim.autopilot.commander import (
     COMMANDED,
     READINESS,
@@ -58,7 +59,7 @@ from firmware_sim.autopilot.requests import (
 from firmware_sim.autopilot.snapshot import Parts, Snapshot
 from firmware_sim.engine.controller import Controller
 from firmware_sim.engine.record import LANDING, LIFT_OFF, NOTHING
-from firmware_sim.engine.ticks import REPEATED_BITS, control_record, detect_record
+from firmware_sim.engine.ticks import CLIMBED, REPEATED_BITS, control_record, detect_record
 from firmware_sim.interfaces import (
     ActuatorControls,
     DistanceReading,
@@ -67,10 +68,6 @@ from firmware_sim.interfaces import (
     SensorSample,
     Truth,
 )
-
-DECIDE_US = 20_000
-"""Time between two decisions of a mode whose demand changes in flight: PX4's flight modes run at 50
-Hz (FlightModeManager) [µs]."""
 
 CLIENTS_SENSOR = 1
 """Source of ranges: not the vehicle's own sensor."""
@@ -96,7 +93,7 @@ class BuiltinAutopilot:
         self.record = record = self.estimator.record
         """Samples, estimate, control loops."""
         self._state = self.estimator.state
-        self._guidance = Guidance(value, self._say)
+        self._guidance = Guidance(value, self._say, record)
         self._navigator = Navigator(self.plans, value, self)
         self._guidance.context.return_place = self._return_place
         self._manual_control = ManualControl(value)
@@ -167,6 +164,9 @@ class BuiltinAutopilot:
         """Take one tick's sensors and return the motor commands until the next."""
         self.take(sample)
         self.decide_if_due()
+        if climb_record(self.record):
+            self._due_us = 0
+            self.decide_if_due()
         if self._demand is not None:
             control_record(self.record)
         if detect_record(self.record):
@@ -249,6 +249,10 @@ class BuiltinAutopilot:
         said = len(self._messages) + len(self._events) > self._unsaid
         if said or not (self._is_settled and self._is_idle()):
             return False
+        climb = self._guidance.context.climb
+        if climb.has_ended or self._due_us == 0:
+            return False
+        self.record["climb_due_us"] = self._taken_us
         if self._guidance.is_done(self._state):
             return False
         if not supervisor.is_unchanged(self._taken_us, flight):
@@ -301,15 +305,17 @@ class BuiltinAutopilot:
         sensors.repeated(sample.time_us, left, left >> REPEATED_BITS)
         self.estimator.fuse_rest(sensors.trusted(sample) if sensors.distrusted else sample)
 
-    def flown(self, read: Callable[[], SensorSample]) -> bool:
+    def flown(self, read: Callable[[], SensorSample], event: int) -> bool:
         """Take note of compiled ticks; return whether the commander's state has changed by them.
 
-        `read` returns the newest sample, which the estimator has taken.
+        Args:
+            read: Returns the newest sample, which the estimator has taken.
+            event: What ended them (`engine.ticks`).
         """
         before, self._snapshot = self._commander.flight, None
         self._taken_us = self.estimator.flown()
         self._newest.follow(read)
-        if not self.record["aligned"].item(0):
+        if not self.record["aligned"].item(0) or event == CLIMBED:
             self._due_us = 0
         if self.record["detected"].item(0):
             self._handle_detected()

@@ -9,8 +9,37 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+from numba.extending import register_jitable
+
 from airl_mav.core.constants import US_PER_S
+from airl_mav.core.kernels import kernel
+from firmware_sim.autopilot.error_state import P
 from firmware_sim.autopilot.trajectory import braking_speed
+from firmware_sim.engine.record import (
+    CLIMB_ENDED,
+    NO_CLIMB,
+    RISING,
+    SETTLING,
+    Fields,
+    Record,
+    new_controller,
+)
+
+DECIDE_US = 20_000
+"""Time between two decisions of a mode whose demand changes in flight: PX4's flight modes run at 50
+Hz (FlightModeManager) [µs]."""
+
+SETTLED_M = 0.01
+"""From this close to it, the take-off altitude is held like any other [m]."""
+
+HEIGHT, SPEED, TARGET, HOME_DOWN, END, NEAR_GROUND = range(6)
+"""Layout of `climb`: present height [m] and vertical speed, upwards positive [m/s]; the altitude;
+home, NED; where the take-off ends, and the next mode climbs on; up to where it climbs gently."""
+
+_GENTLY, _UP, _DOWN = range(3)
+"""Rows of `climb_limits`, each as `ClimbLimits`."""
+
+register_jitable(braking_speed)
 
 
 class ClimbLimits(NamedTuple):
@@ -21,32 +50,124 @@ class ClimbLimits(NamedTuple):
     jerk_m_s3: float
 
 
-def approach_speed(distance_m: float, limits: ClimbLimits) -> float:
-    """Return the greatest speed [m/s] that can still be braked within a distance [m] >= 0."""
-    speed, acceleration, jerk = limits
-    return min(speed, braking_speed(distance_m, acceleration, jerk))
+@kernel
+def move_on(c: Fields, now_us: int) -> None:
+    """Move the climb of a flight controller on to a time [µs], which rises from call to call."""
+    own, row = c.climb, _DOWN
+    if own[TARGET] > own[HEIGHT]:
+        row = _GENTLY if c.climbs == RISING and own[HEIGHT] < own[NEAR_GROUND] else _UP
+    speed, acceleration, jerk = (
+        c.climb_limits[row, 0],
+        c.climb_limits[row, 1],
+        c.climb_limits[row, 2],
+    )
+    elapsed_s = 0.0 if c.climb_us < 0 else (now_us - c.climb_us) / US_PER_S
+    c.climb_us = now_us
+    own[HEIGHT] += own[SPEED] * elapsed_s
+    left_m = own[TARGET] - own[HEIGHT]
+    # The greatest speed that can still be braked.
+    wanted = math.copysign(min(speed, braking_speed(abs(left_m), acceleration, jerk)), left_m)
+    most = acceleration * elapsed_s
+    own[SPEED] += min(most, max(-most, wanted - own[SPEED]))
+
+
+@kernel
+def climb_if_due(c: Fields) -> bool:
+    """Let a climb change the demand when that is due; return whether the take-off has ended."""
+    own = c.climb
+    if c.climbs not in (RISING, SETTLING) or c.time_us < c.climb_due_us:
+        return False
+    if c.climbs == RISING:
+        height_m = own[HOME_DOWN] - c.state[P + 2]
+        if height_m > own[END]:
+            c.climbs = CLIMB_ENDED
+            return True
+        own[HEIGHT] = height_m
+    move_on(c, c.time_us)
+    c.climb_due_us, c.demand[5] = c.time_us + DECIDE_US, -own[SPEED]
+    if c.climbs == SETTLING:
+        c.demand[2] = own[HOME_DOWN] - own[HEIGHT]
+        if abs(own[TARGET] - own[HEIGHT]) <= SETTLED_M:
+            c.climbs = CLIMB_ENDED
+    return False
+
+
+@kernel
+def climb_record(controller: Record) -> bool:
+    """Let the climb of a record (1,) change the demand; as `climb_if_due`."""
+    ended: bool = climb_if_due(controller[0])
+    return ended
+
+
+@kernel
+def _move_record_on(controller: Record, now_us: int) -> None:
+    move_on(controller[0], now_us)
 
 
 class Climb:
-    """A vertical trajectory towards a height. Its speed changes no faster than its limits."""
+    """A vertical trajectory towards a height. Its speed changes no faster than its limits.
 
-    def __init__(self) -> None:
-        self.height_m = 0.0
-        """Present height [m]."""
-        self.speed_m_s = 0.0
-        """Present vertical speed, upwards positive [m/s]."""
-        self._time_us: int | None = None
+    Where it is flown (`fly`), compiled ticks move it on.
+    """
+
+    def __init__(self, record: Record | None = None) -> None:
+        """Start in the record of a flight controller; None = in a new one."""
+        self._record = record = new_controller() if record is None else record
+        self._own, self._limits = record["climb"][0], record["climb_limits"][0]
+
+    height_m = property(lambda self: self._own.item(HEIGHT))
+    """Present height [m]."""
+    speed_m_s = property(lambda self: self._own.item(SPEED))
+    """Present vertical speed, upwards positive [m/s]."""
+
+    @property
+    def flies(self) -> bool:
+        """Whether compiled ticks move it on."""
+        return self._record["climbs"].item(0) in (RISING, SETTLING)
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether they have brought it to its end, which its mode has not noticed yet."""
+        return self._record["climbs"].item(0) == CLIMB_ENDED
 
     def restart(self, speed_m_s: float) -> None:
         """Continue from a vertical speed [m/s]."""
-        self.speed_m_s, self._time_us = speed_m_s, None
+        self._own[SPEED], self._record["climb_us"] = speed_m_s, -1
 
-    def towards(self, height_m: float, limits: ClimbLimits, time_us: int) -> None:
-        """Move on to a time [µs], which rises from call to call, on the way to a height [m]."""
-        elapsed_s = 0.0 if self._time_us is None else (time_us - self._time_us) / US_PER_S
-        self._time_us = time_us
-        self.height_m += self.speed_m_s * elapsed_s
-        left_m = height_m - self.height_m
-        wanted = math.copysign(approach_speed(abs(left_m), limits), left_m)
-        most = limits.acceleration_m_s2 * elapsed_s
-        self.speed_m_s += min(most, max(-most, wanted - self.speed_m_s))
+    def stop(self, *, ended: bool = False) -> None:
+        """Leave the demand to Python; `ended` = until its mode notices that it has ended."""
+        self._record["climbs"] = CLIMB_ENDED if ended else NO_CLIMB
+
+    def aim(
+        self,
+        target_m: float,
+        home_down_m: float,
+        end_m: float,
+        near_ground_m: float,
+        limits: tuple[ClimbLimits, ClimbLimits, ClimbLimits],
+    ) -> None:
+        """Say where it leads.
+
+        Args:
+            target_m: Height above home [m].
+            home_down_m: Home, local NED [m].
+            end_m: Height at which the take-off ends [m].
+            near_ground_m: A take-off climbs gently up to this height [m].
+            limits: Near the ground, upwards, downwards.
+        """
+        self._own[TARGET:] = target_m, home_down_m, end_m, near_ground_m
+        self._limits[:] = limits
+
+    def fly(self, kind: int, time_us: int, height_m: float | None = None) -> None:
+        """Move on to a time [µs], and let compiled ticks move it on from there.
+
+        Args:
+            kind: `RISING` or `SETTLING`.
+            time_us: Rises from call to call.
+            height_m: Where the vehicle is; None = where the trajectory is.
+        """
+        if height_m is not None:
+            self._own[HEIGHT] = height_m
+        self._record["climbs"] = kind
+        self._record["climb_due_us"] = time_us + DECIDE_US
+        _move_record_on(self._record, time_us)

@@ -10,11 +10,13 @@ from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S
 from airl_mav.core.frames import Vector
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.autopilot_state import Message, Mode, Severity
+from firmware_sim.autopilot.climb import Climb
 from firmware_sim.autopilot.commander import Phase
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.modes import MODES
 from firmware_sim.autopilot.modes.interface import NAN, FlightContext, FlightMode, here
 from firmware_sim.autopilot.requests import Request
+from firmware_sim.engine.record import Record
 
 # Bound once: looking up a member of an enumeration at every tick is slow.
 _GROUND, _AIR = Phase.GROUND, Phase.AIR
@@ -26,9 +28,17 @@ class Guidance:
     Every `state` is the estimator's newest nominal state (`error_state`).
     """
 
-    def __init__(self, value: Callable[[str], float], say: Callable[[Message], None]) -> None:
-        """Take a lookup of PX4 parameter names, and what tells the operators something."""
-        self.context = FlightContext(value, say=say)
+    def __init__(
+        self, value: Callable[[str], float], say: Callable[[Message], None], record: Record
+    ) -> None:
+        """Begin in Hold.
+
+        Args:
+            value: Looks up PX4 parameters by name.
+            say: Tells the operators something.
+            record: Of the flight controller.
+        """
+        self.context = FlightContext(value, Climb(record), say=say)
         """Shared by the modes."""
         self._modes = {mode: new(self.context) for mode, new in MODES.items()}
         self._flown: FlightMode = self._modes[Mode.HOLD]
@@ -38,6 +48,7 @@ class Guidance:
 
     def enter(self, mode: Mode, state: Vector, request: Request | None = None) -> None:
         """Begin a mode at the present state, with what the user asks for beyond its name."""
+        self.context.climb.stop()
         self._stopped = mode is Mode.TERMINATION
         if self._stopped:
             return

@@ -7,11 +7,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from operator import attrgetter
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import numpy as np
-
-from airl_mav.control.demand import AnyDemand, AttitudeDemand, RateDemand
+from airl_mav.control.demand import AnyDemand
+from airl_mav.core.frames import Vector
 from firmware_sim.autopilot.autopilot_state import (
     Clearance,
     CommanderStatus,
@@ -30,7 +29,22 @@ from firmware_sim.autopilot.navigation.plan import Plans
 from firmware_sim.autopilot.navigation.progress import progress
 from firmware_sim.autopilot.newest_sensors import NewestSensors
 from firmware_sim.engine.controller import Controller, ControlSetpoints
+from firmware_sim.engine.record import POSITION, TRAJECTORY
 from firmware_sim.interfaces import SensorSample
+
+
+def setpoint_of(tick: Any, velocity: Vector) -> Setpoint:
+    """Return what the controller tracks in a tick.
+
+    Args:
+        tick: Record of the flight controller or of its log (`engine.record`), an element.
+        velocity: Setpoint of the velocity loop (3,) NED [m/s].
+    """
+    kind, demand = tick["demand_kind"], tick["demand"].copy()
+    if kind not in (POSITION, TRAJECTORY):
+        return Setpoint(tick["state"][:3].copy(), velocity, math.nan, 0.0)
+    yaw = 6 if kind == POSITION else 9
+    return Setpoint(demand[:3], velocity, float(demand[yaw]), float(demand[yaw + 1]))
 
 
 class Parts(NamedTuple):
@@ -78,10 +92,7 @@ class Snapshot:
 
     @property
     def setpoint(self) -> Setpoint:
-        demand, velocity = self._demand, self._setpoints.velocity
-        if demand is None or isinstance(demand, AttitudeDemand | RateDemand):
-            return Setpoint(self.estimate.position, velocity, math.nan, 0.0)
-        return Setpoint(np.array(demand.position), velocity, demand.yaw, demand.yaw_rate)
+        return setpoint_of(self._parts.estimator.record[0], self._setpoints.velocity)
 
     attitude_setpoint = property(attrgetter("_setpoints.attitude"))
     rate_setpoint = property(attrgetter("_setpoints.rates"))

@@ -34,6 +34,9 @@ MAG, PRESSURE, GPS = 1, 2, 4
 IDLE, POSITION, TRAJECTORY, ATTITUDE, RATES = -1, 0, 1, 2, 3
 """Values of `demand_kind`: motors stopped, or the kind of demand (`control.demand`)."""
 
+NO_CLIMB, RISING, SETTLING, CLIMB_ENDED = range(4)
+"""Values of `climbs`: a take-off's climb up to near its altitude, or the rest of it in hold."""
+
 OFF, TRUSTED, SUSPECT = 0, 1, 2
 """Values of `compass` and `gps`; Python judges every sample of a suspect one."""
 
@@ -191,6 +194,12 @@ CONTROLLER = np.dtype(
         ("demand", _F, DEMAND_SIZE),
         ("output", _F, OUTPUT_SIZE),
         ("motors", _F, 4),
+        # Climb of a take-off, as `autopilot.climb`.
+        ("climbs", _I),
+        ("climb_us", _I),  # when it moved on last; -1 = it begins
+        ("climb_due_us", _I),
+        ("climb", _F, 6),
+        ("climb_limits", _F, (3, 3)),
         # Land detector.
         ("detecting", _I),  # NOTHING, LIFT_OFF or LANDING
         ("detected", _I),  # 1 = it was detected in the newest tick
@@ -245,7 +254,7 @@ def new_controller() -> Record:
     """Return a record of a flight controller that has just booted."""
     record = np.zeros(1, CONTROLLER)
     never = ("baro_fused_us", "heading_fused_us", "gps_horizontal_us", "gps_vertical_us")
-    for name in (*never, "watch", "still_since_us", "rest_since_us"):
+    for name in (*never, "watch", "still_since_us", "rest_since_us", "climb_us"):
         record[name] = -1
     record["origin"] = record["velocity_before"] = np.nan
     record["velocity_noise"] = 1.0

@@ -41,6 +41,7 @@ from airl_mav.vehicle.rigid_body import accelerate, drift
 from airl_mav.vehicle.rotation import Vec, conjugate, rotate
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.alignment import ALIGN_US, FIXES, add
+from firmware_sim.autopilot.climb import climb_if_due
 from firmware_sim.autopilot.consistency import FAR, note_velocity
 from firmware_sim.autopilot.emergency_yaw import REFUSED_US
 from firmware_sim.autopilot.filter_kernel import fuse, predict, spread
@@ -71,11 +72,12 @@ from firmware_sim.engine.record import (
     Record,
 )
 
-NONE, NOISE, ROOM, FUSE, HEALTH, DETECTED, COLLIDED, ALIGN, EMPTY = range(9)
+NONE, NOISE, ROOM, FUSE, HEALTH, DETECTED, COLLIDED, ALIGN, EMPTY, CLIMBED = range(10)
 """Why `stretch` returned: all ticks are flown; a block of noise is used up; a contact is possible
 in the coming tick; Python has to fuse what the newest tick measured; the estimator has converged,
 or no longer is; the land detector has detected lift-off or landing; the vehicle has hit something
-(`Plant.touch`); the estimator may be aligned, or has its first fix; the battery is empty."""
+(`Plant.touch`); the estimator may be aligned, or has its first fix; the battery is empty; the
+take-off has come near its altitude."""
 
 REPEATED_BITS = 3
 """`estimate` returns bits of `measured`; shifted by so many, which sensors repeated their last
@@ -730,6 +732,8 @@ def stretch(
             or (not steady and at[_WIND] >= len(wind))
         ):
             return k << EVENT_BITS | NOISE
+        if climb_if_due(c):
+            return k << EVENT_BITS | CLIMBED
         if not _is_clear(a) or (a.resting != 0 and a.held == 0):
             return k << EVENT_BITS | ROOM
         row, charged = flown[k], a.charge > 0.0

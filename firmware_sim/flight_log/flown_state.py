@@ -4,15 +4,13 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 from airl_mav.core.frames import Vector
 from firmware_sim.autopilot import error_state as es
 from firmware_sim.autopilot.autopilot_state import AutopilotState, Estimate, Setpoint
+from firmware_sim.autopilot.snapshot import setpoint_of
 from firmware_sim.engine.kinematics import POSITION, QUATERNION, RATES, VELOCITY
-from firmware_sim.engine.record import POSITION as POSITION_DEMAND
-from firmware_sim.engine.record import TRAJECTORY
 from firmware_sim.interfaces import BatterySample, Truth
 
 
@@ -60,12 +58,7 @@ class FlownState:
 
     @property
     def setpoint(self) -> Setpoint:
-        kind, demand = self._tick["demand_kind"], self._tick["demand"].copy()
-        velocity = self._output(7, 10)
-        if kind not in (POSITION_DEMAND, TRAJECTORY):
-            return Setpoint(self._tick["state"][:3].copy(), velocity, math.nan, 0.0)
-        yaw = 6 if kind == POSITION_DEMAND else 9
-        return Setpoint(demand[:3], velocity, float(demand[yaw]), float(demand[yaw + 1]))
+        return setpoint_of(self._tick, self._output(7, 10))
 
     attitude_setpoint = property(lambda self: self._output(0, 4))
     rate_setpoint = property(lambda self: self._output(4, 7))

@@ -18,10 +18,12 @@ from airl_mav.vehicle.power import PowerModel, standing_power_w
 from airl_mav.vehicle.rotation import Quat, Vec
 from airl_mav.vehicle.rotor import lag
 from airl_mav.vehicle.wind import Wind
+from firmware_sim.autopilot.climb import climb_record
 from firmware_sim.engine.dynamics import Speeds, pack_row, supply
 from firmware_sim.engine.kinematics import POSITION, QUATERNION, RATES, VELOCITY
 from firmware_sim.engine.record import Record, new_aircraft
 from firmware_sim.engine.ticks import (
+    CLIMBED,
     COLLIDED,
     DETECTED,
     EVENT_BITS,
@@ -281,6 +283,8 @@ class Plant:
         """
         record, sensors, before = self.record, self._sensors, len(self.collisions)
         for k in range(ticks):
+            if climb_record(controller):
+                return k, CLIMBED
             wind = self._wind_now()
             pushed = begin_touch(controller, record, flown[k : k + 1], wind)
             after = self._moved(*pushed)

@@ -11,7 +11,9 @@ from hypothesis import strategies as st
 
 from airl_mav.core.constants import TICK_US
 from firmware_sim.autopilot.autopilot_state import Mode
-from firmware_sim.autopilot.climb import Climb, ClimbLimits, approach_speed
+from firmware_sim.autopilot.climb import Climb, ClimbLimits
+from firmware_sim.autopilot.trajectory import braking_speed
+from firmware_sim.engine.record import SETTLING
 from tests.support.flight_rig import flight
 
 GENTLE = ClimbLimits(1.5, 0.5, 4.0)
@@ -29,28 +31,24 @@ the floor: mean of two flights (`airl-sitl --firmware px4 --episodes 2`)."""
     acceleration=st.floats(0.2, 15.0),
     jerk=st.floats(1.0, 80.0),
 )
-def test_the_approach_speed_can_be_braked(
+def test_the_braking_speed_can_be_braked(
     distance: float, acceleration: float, jerk: float
 ) -> None:
     """v v / 2a at full deceleration, and 2 v a / jerk to build it up, fill the distance."""
-    v = approach_speed(distance, ClimbLimits(1e9, acceleration, jerk))
+    v = braking_speed(distance, acceleration, jerk)
     covered = v * v / (2.0 * acceleration) + 2.0 * v * acceleration / jerk
     assert covered == pytest.approx(distance, rel=1e-6, abs=1e-6)
-
-
-def test_the_approach_speed_has_a_limit() -> None:
-    assert approach_speed(1e4, BRISK) == 3.0
-    assert approach_speed(0.0, BRISK) == 0.0
 
 
 @pytest.mark.parametrize("limits", [GENTLE, BRISK])
 @pytest.mark.parametrize("way", [7.0, -7.0, 0.4])
 def test_a_climb_keeps_its_limits_and_arrives(limits: ClimbLimits, way: float) -> None:
     climb = Climb()
+    climb.aim(way, 0.0, math.inf, 0.0, (limits, limits, limits))
     climb.restart(0.0)
     speeds, heights = [], []
     for tick in range(round(25e6 / TICK_US)):
-        climb.towards(way, limits, tick * TICK_US)
+        climb.fly(SETTLING, tick * TICK_US)
         speeds.append(climb.speed_m_s)
         heights.append(climb.height_m)
     assert np.max(np.abs(speeds)) <= limits.speed_m_s + 1e-9

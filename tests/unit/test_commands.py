@@ -169,10 +169,10 @@ def test_body_rates_overtake_the_velocity_before_them() -> None:
     log = SetpointLog()
     log.accepted((1.0, 0.0, 0.0, 0.0), 1_000)
     log.take(2)
-    log.flown([4_000])
+    log.flown(4_000, 1)
     log.accepted((0.1, 0.2, 0.3, 0.5), 5_000)
     log.take(0)
-    log.flown([8_000, 12_000])
+    log.flown(8_000, 2)
     found = log.arrays()
     np.testing.assert_array_equal(found["accepted_us"], [1_000, 5_000])
     np.testing.assert_array_equal(found["motor_us"], [12_000, 8_000])
@@ -182,7 +182,7 @@ def test_a_setpoint_that_no_motor_has_flown_is_not_in_the_record() -> None:
     log = SetpointLog()
     log.accepted((1.0, 0.0, 0.0, 0.0), 1_000)
     log.take(2)
-    log.flown([4_000])
+    log.flown(4_000, 1)
     assert not log.arrays()["accepted_us"].size
 
 

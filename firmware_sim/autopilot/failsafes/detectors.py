@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 from airl_mav.core.constants import US_PER_S
-from airl_mav.core.kernels import kernel
 from airl_mav.core.frames import Vector
+from airl_mav.core.kernels import kernel
 from firmware_sim.autopilot.error_state import Q
 
 VALID_AFTER_US = US_PER_S

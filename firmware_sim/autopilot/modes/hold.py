@@ -7,6 +7,7 @@ import math
 from airl_mav.control.demand import AnyDemand, Demand
 from airl_mav.core.frames import Vector
 from airl_mav.vehicle.rotation import Vec
+from firmware_sim.autopilot.climb import SETTLED_M
 from firmware_sim.autopilot.error_state import P, V
 from firmware_sim.autopilot.modes.interface import (
     FREE,
@@ -16,13 +17,11 @@ from firmware_sim.autopilot.modes.interface import (
     here,
     triple,
 )
-from firmware_sim.autopilot.modes.takeoff import climb_on
+from firmware_sim.autopilot.modes.takeoff import aim
 from firmware_sim.autopilot.requests import ClimbOn, Place, Reposition, Request
 from firmware_sim.autopilot.trajectory import Leg
 from firmware_sim.autopilot.travel import stopping_place
-
-SETTLED_M = 0.01
-"""From this close to it, the take-off altitude is held like any other [m]."""
+from firmware_sim.engine.record import SETTLING
 
 STANDING_M_S = 0.3
 """From this speed on the vehicle counts as at rest: hold keeps the place where it is [m/s]."""
@@ -41,8 +40,9 @@ class Hold(FlightMode):
 
     @property
     def is_steady(self) -> bool:
-        """Whether it holds its place."""
-        return not (self._travelling or self._settling or self._braking)
+        """Whether it holds its place, or compiled ticks fly it there."""
+        settling = self._settling and not self._context.climb.flies
+        return not (self._travelling or settling or self._braking)
 
     @property
     def destination(self) -> Vec | None:
@@ -67,8 +67,11 @@ class Hold(FlightMode):
             place = self._place
             leg = Leg(place.position)
             return self._context.travel.fly(state, time_us, leg, yaw=place.yaw)
-        if self._settling:
+        if self._settling and not self._context.climb.has_ended:
             return self._settle(time_us)
+        if self._settling:
+            self._settling = False
+            self._context.climb.stop()
         if self._braking:
             self._place = self._place._replace(position=triple(state, P))
             if math.hypot(*triple(state, V)) > STANDING_M_S:
@@ -97,9 +100,11 @@ class Hold(FlightMode):
     def _settle(self, time_us: int) -> Demand:
         """Return the demand between the end of a take-off and its altitude."""
         context, climb = self._context, self._context.climb
-        climb_on(context, time_us, near_ground=False)
+        aim(context)
+        climb.fly(SETTLING, time_us)
         north, east, _ = self._place.position
-        self._settling = abs(context.takeoff_altitude_m - climb.height_m) > SETTLED_M
+        if abs(context.takeoff_altitude_m - climb.height_m) <= SETTLED_M:
+            climb.stop(ended=True)
         return Demand(
             (north, east, context.home[2] - climb.height_m),
             (NAN, NAN, -climb.speed_m_s),

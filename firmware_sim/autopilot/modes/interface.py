@@ -33,14 +33,14 @@ class FlightContext:
 
     value: Callable[[str], float]
     """Looks up a PX4 parameter by its name."""
+    climb: Climb
+    """The vertical trajectory of a take-off, which hold goes on with."""
     home: Vec = (0.0, 0.0, 0.0)
     """Local NED [m]."""
     takeoff_altitude_m: float = 0.0
     """Height above home that a take-off climbs to [m]."""
     takeoff_place: tuple[float, float] | None = None
     """Where it leads, north and east [m]; None = straight up."""
-    climb: Climb = field(default_factory=Climb)
-    """The vertical trajectory of a take-off, which hold goes on with."""
     say: Callable[[Message], None] = lambda _message: None
     """Tells the operators something."""
     home_yaw: float = 0.0

@@ -17,6 +17,7 @@ from firmware_sim.autopilot.modes.interface import (
 )
 from firmware_sim.autopilot.requests import ClimbOn, Place, Reposition, Request
 from firmware_sim.autopilot.trajectory import Leg, PathLimits
+from firmware_sim.engine.record import RISING
 
 LEAST_CLIMB_M = 0.1
 """A take-off that asks for less than this above where the vehicle stands leaves it there [m]."""
@@ -35,6 +36,11 @@ class Takeoff(FlightMode):
     def lifts(self) -> bool:
         """Whether the altitude lies above the ground."""
         return self._context.takeoff_altitude_m > LEAST_CLIMB_M
+
+    @property
+    def is_steady(self) -> bool:
+        """Whether compiled ticks fly it."""
+        return self._context.climb.flies
 
     @property
     def destination(self) -> Vec | None:
@@ -59,8 +65,10 @@ class Takeoff(FlightMode):
         # The trajectory stays where the vehicle is: it must not wait below the ground while the
         # thrust ramps up, nor be chased after it.
         climb = self._context.climb
-        climb.height_m = self._context.height(state)
-        climb_on(self._context, time_us, near_ground=True)
+        aim(self._context)
+        climb.fly(RISING, time_us, self._context.height(state))
+        if self._context.standing:
+            climb.stop()
         return over(self._place, -climb.speed_m_s)
 
     def _fly(self, state: Vector, time_us: int) -> AnyDemand:
@@ -86,9 +94,7 @@ class Takeoff(FlightMode):
 
         Source: PX4 1.16, MissionBlock; half of an altitude that is smaller than the radius.
         """
-        altitude, radius = self._context.takeoff_altitude_m, self._context.value("NAV_MC_ALT_RAD")
-        near = altitude / 2.0 if altitude < radius else radius
-        return self._context.height(state) > altitude - near
+        return self._context.height(state) > _end_m(self._context)
 
 
 def leave_ground(context: FlightContext, state: Vector, time_us: int) -> Demand:
@@ -109,18 +115,23 @@ def gentle(limits: PathLimits, context: FlightContext, state: Vector) -> PathLim
     return limits._replace(up_m_s=speed, up_m_s2=acceleration)
 
 
-def climb_on(context: FlightContext, time_us: int, *, near_ground: bool) -> None:
-    """Advance the trajectory towards the take-off altitude, gently where that is near the ground.
+def _end_m(context: FlightContext) -> float:
+    """Return the height above home at which a take-off has come near its altitude [m]."""
+    altitude, radius = context.takeoff_altitude_m, context.value("NAV_MC_ALT_RAD")
+    return altitude - (altitude / 2.0 if altitude < radius else radius)
 
-    The limits are those of PX4's FlightTaskAuto.
-    """
-    climb, target, value = context.climb, context.takeoff_altitude_m, context.value
-    jerk = value("MPC_JERK_AUTO")
-    if target > climb.height_m:
-        speed, acceleration = value("MPC_Z_V_AUTO_UP"), value("MPC_ACC_UP_MAX")
-        if near_ground and climb.height_m < value("MPC_LAND_ALT1"):
-            speed = value("MPC_TKO_SPEED")
-            acceleration = min(acceleration, speed / max(value("MPC_TKO_RAMP_T"), 1e-3))
-    else:
-        speed, acceleration = value("MPC_Z_V_AUTO_DN"), value("MPC_ACC_DOWN_MAX")
-    climb.towards(target, ClimbLimits(speed, acceleration, jerk), time_us)
+
+def aim(context: FlightContext) -> None:
+    """Direct the climb to the take-off altitude, by the limits of PX4's FlightTaskAuto."""
+    value = context.value
+    jerk, brisk_m_s2 = value("MPC_JERK_AUTO"), value("MPC_ACC_UP_MAX")
+    slow = value("MPC_TKO_SPEED")
+    gently = min(brisk_m_s2, slow / max(value("MPC_TKO_RAMP_T"), 1e-3))
+    context.climb.aim(
+        *(context.takeoff_altitude_m, context.home[2], _end_m(context), value("MPC_LAND_ALT1")),
+        (
+            ClimbLimits(slow, gently, jerk),
+            ClimbLimits(value("MPC_Z_V_AUTO_UP"), brisk_m_s2, jerk),
+            ClimbLimits(value("MPC_Z_V_AUTO_DN"), value("MPC_ACC_DOWN_MAX"), jerk),
+        ),
+    )
