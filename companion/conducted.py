@@ -6,7 +6,7 @@ import threading
 from typing import NamedTuple, Protocol
 
 from airl_mav.core.clock import Clock
-from companion.interfaces import Due
+from companion.interfaces import Due, Quiet
 from companion.watchdog import Watchdog
 
 
@@ -15,8 +15,8 @@ class Poll(NamedTuple):
 
     every_us: int
     due: Due
-    by_heartbeat: bool = False
-    """Whether heartbeats alone change the condition."""
+    quiet_us: Quiet | None = None
+    """Tells, where `due` does not hold, which checks may be left out; None = none."""
 
 
 class Sleep(Protocol):
@@ -57,11 +57,11 @@ class ConductedClock:
             if watchdog is not None and due_us is not None and self.time_us() >= due_us:
                 watchdog.look()
 
-    def poll(self, every_us: int, due: Due, by_heartbeat: bool) -> None:
+    def poll(self, every_us: int, due: Due, quiet_us: Quiet) -> None:
         """Sleep for one interval [µs] or several, until a condition has to be checked."""
         wake_us = self.time_us() + every_us
         if self._watchdog is None:
-            self._sleep(wake_us, None, Poll(every_us, due, by_heartbeat))
+            self._sleep(wake_us, None, Poll(every_us, due, quiet_us))
         else:
             self.sleep_until(wake_us)
 

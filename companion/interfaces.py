@@ -58,6 +58,9 @@ class BodyVelocity(NamedTuple):
 STOP = BodyVelocity(0.0, 0.0, 0.0, 0.0)
 
 Due: TypeAlias = "Callable[[Sequence[bytes]], bool]"
+Quiet: TypeAlias = "Callable[[Sequence[bytes]], float]"
+"""Returns by the newest frames for how long at least a condition fails on [µs]; inf = until the
+next heartbeat."""
 """Returns whether a condition has to be checked, given the MAVLink frames of the flight controller
 that MAVSDK has not received yet."""
 

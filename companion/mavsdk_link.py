@@ -63,7 +63,7 @@ _HEARTBEAT, _LOCAL_POSITION_NED = b"\x00\x00\x00", b"\x20\x00\x00"
 _BASE_MODE, _ARMED = 6, 0x80
 """Offset of a HEARTBEAT's base mode, and its bit for armed."""
 
-_DOWN = struct.Struct("<12xf12x")
+_DOWN = struct.Struct("<12xf8xf")
 """Payload of LOCAL_POSITION_NED; its z [m]."""
 
 
@@ -76,7 +76,7 @@ class MavsdkLink:
         clock: Clock,
         abandon: threading.Event | None = None,
         heard: Callable[[], bool] | None = None,
-        poll: Callable[[int, interfaces.Due, bool], None] | None = None,
+        poll: Callable[[int, interfaces.Due, interfaces.Quiet], None] | None = None,
     ) -> None:
         """Open a connection, as `open_connection`; `connect` waits for the vehicle.
 
@@ -312,9 +312,23 @@ class MavsdkLink:
         self._call("take-off", self._action.takeoff)
         deadline_us, least_m = self._deadline(timeout_s), altitude_m - constants.TAKEOFF_REACHED_M
 
-        def high(frames: Sequence[bytes]) -> bool:
+        def left(frames: Sequence[bytes]) -> tuple[float, float]:
+            """Return how much is left of the climb [m], and its speed [m/s]; NaN = not known."""
             position = _newest(frames, _LOCAL_POSITION_NED)
-            return position is not None and start_down - _down(position) > least_m
+            if position is None:
+                return math.nan, math.nan
+            down_m, down_m_s = _down(position)
+            return least_m - (start_down - down_m), max(0.0, -down_m_s)
+
+        def high(frames: Sequence[bytes]) -> bool:
+            return left(frames)[0] < 0.0
+
+        def lasts_us(frames: Sequence[bytes]) -> float:
+            """Return how long the climb takes at least, if it speeds up by 1 g."""
+            left_m, speed = left(frames)
+            g = constants.GRAVITY_M_S2
+            least_s = (math.sqrt(speed**2 + 2.0 * g * max(0.0, left_m)) - speed) / g
+            return 0.0 if math.isnan(left_m) else least_s * constants.US_PER_S
 
         while True:
             state = self.kinematics()
@@ -322,7 +336,7 @@ class MavsdkLink:
             if height > least_m and speed < constants.TAKEOFF_REACHED_M_S:
                 return
             self._check(deadline_us, f"take-off: {height:.1f} m after {timeout_s:g} s", stop)
-            self._pause_until(high, deadline_us, stop)
+            self._pause_until(high, lasts_us, deadline_us, stop)
 
     def enter_offboard(self) -> None:
         """Send a zero setpoint and switch to offboard; return when setpoints take effect."""
@@ -409,7 +423,7 @@ class MavsdkLink:
         deadline_us = self._deadline(timeout_s)
         while self.armed:
             self._check(deadline_us, f"landing: still armed after {timeout_s:g} s")
-            self._pause_until(_disarmed, deadline_us, by_heartbeat=True)
+            self._pause_until(_disarmed, lambda _: math.inf, deadline_us)
 
     def _call(self, what: str, call: Any) -> None:
         try:
@@ -446,10 +460,9 @@ class MavsdkLink:
     def _pause_until(
         self,
         due: interfaces.Due,
+        quiet_us: interfaces.Quiet,
         deadline_us: int,
         stop: threading.Event | None = None,
-        *,
-        by_heartbeat: bool = False,
     ) -> None:
         """Wait for one `POLL_S`, or for several if `due` tells that a condition still fails."""
         if self._poll is None:
@@ -458,7 +471,7 @@ class MavsdkLink:
             self._poll(
                 int(POLL_S * constants.US_PER_S),
                 lambda frames: due(frames) or self._over(deadline_us, stop=stop) is not None,
-                by_heartbeat,
+                quiet_us,
             )
 
 
@@ -475,12 +488,12 @@ def _disarmed(frames: Sequence[bytes]) -> bool:
     return heartbeat is not None and not heartbeat[_HEADER + _BASE_MODE] & _ARMED
 
 
-def _down(position: bytes) -> float:
-    """Return z of a LOCAL_POSITION_NED [m]."""
+def _down(position: bytes) -> tuple[float, float]:
+    """Return z [m] and vz [m/s] of a LOCAL_POSITION_NED."""
     # MAVLink 2 leaves out the zeros at the end of a payload.
     payload = position[_HEADER : _HEADER + position[1]].ljust(_DOWN.size, b"\0")
-    (down,) = _DOWN.unpack(payload)
-    return float(down)
+    down_m, down_m_s = _DOWN.unpack(payload)
+    return down_m, down_m_s
 
 
 def _known(value: float) -> float | None:

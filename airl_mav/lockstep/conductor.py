@@ -111,8 +111,10 @@ class Conductor:
         if turn.interrupt is not None and turn.interrupt.is_set():
             return 0.0
         wake_us, poll = float(turn.wake_us), turn.poll
-        if poll is not None and poll.by_heartbeat and not poll.due(self._waiting):
-            wake_us = math.inf  # The vehicle stops flying with the tick of the next heartbeat.
+        if poll is not None and poll.quiet_us is not None and not poll.due(self._waiting):
+            # At most to the tick of the next heartbeat: the vehicle stops flying there.
+            checks = poll.quiet_us(self._waiting) / poll.every_us
+            wake_us += poll.every_us * (checks if math.isinf(checks) else max(0, int(checks) - 1))
         if self.is_shown:
             wake_us = min(wake_us, self.clock.time_us() + SHOWN_US)
         return min(wake_us, self.orders_us())
@@ -184,9 +186,9 @@ class Conductor:
         return tick_us
 
     def _pass_over_polls(self, tick_us: int) -> None:
-        """Leave out the checks for a heartbeat before the newest tick began."""
+        """Leave out the checks before the newest tick began: they would fail."""
         wake_us, poll = self._turn.wake_us, self._turn.poll
-        if wake_us is None or poll is None or not poll.by_heartbeat:
+        if wake_us is None or poll is None or poll.quiet_us is None:
             return
         missed_us = tick_us - TICK_US - wake_us
         if missed_us >= 0:

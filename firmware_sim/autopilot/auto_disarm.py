@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 from airl_mav.core.constants import US_PER_S
@@ -21,6 +22,8 @@ class AutoDisarm:
         self._standing_since_us: int | None = None
         self._stopped_since_us: int | None = None
         self._flown = False
+        self.due_us = math.inf
+        """When something is due, unless the flight changes [µs]."""
 
     def armed(self) -> None:
         """A flight begins: time on the ground before it does not count."""
@@ -32,12 +35,14 @@ class AutoDisarm:
         `idle`: the motors are stopped; the spool-up and the ramp of a take-off do not count as time
         on the ground.
         """
+        self.due_us = math.inf
         if flight.mode is _TERMINATION and flight.phase >= _GROUND:
             if self._stopped_since_us is None:
                 self._stopped_since_us = time_us
-            stopped_us = time_us - self._stopped_since_us
-            if stopped_us >= self._value("COM_KILL_DISARM") * US_PER_S:
+            due_us = self._stopped_since_us + self._value("COM_KILL_DISARM") * US_PER_S
+            if time_us >= due_us:
                 return Event.LOCKDOWN_TIMEOUT
+            self.due_us = due_us
             return None
         self._stopped_since_us = None
         if flight.phase is not _GROUND:
@@ -47,6 +52,8 @@ class AutoDisarm:
         if self._standing_since_us is None or not idle:
             self._standing_since_us = time_us
         limit_s = self._value("COM_DISARM_LAND" if self._flown else "COM_DISARM_PRFLT")
-        if limit_s > 0.0 and time_us - self._standing_since_us >= limit_s * US_PER_S:
+        due_us = self._standing_since_us + limit_s * US_PER_S
+        self.due_us = due_us if limit_s > 0.0 and time_us < due_us else math.inf
+        if limit_s > 0.0 and time_us >= due_us:
             return Event.LANDED_TIMEOUT if self._flown else Event.DISARM_TIMEOUT
         return None

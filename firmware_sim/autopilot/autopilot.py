@@ -59,7 +59,7 @@ from firmware_sim.autopilot.requests import (
 from firmware_sim.autopilot.snapshot import Parts, Snapshot
 from firmware_sim.engine.controller import Controller
 from firmware_sim.engine.record import LANDING, LIFT_OFF, NOTHING
-from firmware_sim.engine.ticks import CLIMBED, REPEATED_BITS, control_record, detect_record
+from firmware_sim.engine.ticks import ALIGN, CLIMBED, REPEATED_BITS, control_record, detect_record
 from firmware_sim.interfaces import (
     ActuatorControls,
     DistanceReading,
@@ -196,8 +196,8 @@ class BuiltinAutopilot:
         time_us, supervisor = self._taken_us, self.supervisor
         if time_us < 0:
             return
-        if not self.record["aligned"].item(0):
-            self.estimator.align()
+        if not self.record["aligned"].item(0) and self.estimator.align():
+            self._navigator.due_us = 0
         if self._commander.flight.phase is _AIR and self._guidance.is_done(self._state):
             self._commander.handle(Event.MODE_DONE)
         if self._home.place is None and self.estimator.origin is not None:
@@ -288,7 +288,9 @@ class BuiltinAutopilot:
         self.record["detecting"] = (
             LANDING if phase is _AIR else LIFT_OFF if phase is _GROUND else NOTHING
         )
-        self._due_us = min(self.supervisor.next_us, self._navigator.due_us)
+        self._due_us = min(
+            self.supervisor.next_us, self._navigator.due_us, self._auto_disarm.due_us
+        )
         steady = self._guidance.is_steady(phase) and not self._manual_control.was_heard
         self._is_settled = steady and phase is _AIR
         if not steady:
@@ -315,7 +317,7 @@ class BuiltinAutopilot:
         before, self._snapshot = self._commander.flight, None
         self._taken_us = self.estimator.flown()
         self._newest.follow(read)
-        if not self.record["aligned"].item(0) or event == CLIMBED:
+        if event in (ALIGN, CLIMBED):
             self._due_us = 0
         if self.record["detected"].item(0):
             self._handle_detected()
@@ -335,7 +337,9 @@ class BuiltinAutopilot:
             navigator.due_us = self._taken_us + IDLE_US
             return
         situation = self._situation()
-        if situation is not None:
+        if situation is None:
+            navigator.due_us = self._taken_us + IDLE_US
+        else:
             self._navigated_on = self._navigates_on()
             navigator.step(situation, flight.mode, self._whereabouts.fenced_place, armed=armed)
             navigator.tell(self._guidance.context, self.supervisor.watch.reports)

@@ -95,8 +95,7 @@ def climb_if_due(c: Fields) -> bool:
 @kernel
 def climb_record(controller: Record) -> bool:
     """Let the climb of a record (1,) change the demand; as `climb_if_due`."""
-    ended: bool = climb_if_due(controller[0])
-    return ended
+    return bool(climb_if_due(controller[0]))
 
 
 @kernel

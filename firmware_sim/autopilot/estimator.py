@@ -447,11 +447,11 @@ class Estimator:
 
     # --- start
 
-    def align(self) -> None:
-        """Align attitude, height and place by what was averaged at rest, if that is enough."""
+    def align(self) -> bool:
+        """Align attitude, height and place by what was averaged at rest; return whether it can."""
         aligned = self._alignment.finish()
         if aligned is None:
-            return
+            return False
         self.aligned = self.is_changed = True
         self.state[es.Q : es.RATES] = aligned.quaternion
         self.vision.is_north_known = aligned.by_compass
@@ -460,6 +460,7 @@ class Estimator:
             self.origin, self._fixed_us = aligned.fix, self._time_us
         if self._chosen_origin is not None:
             self.move_origin(self._chosen_origin)
+        return True
 
     @property
     def _uses_gps(self) -> bool:

@@ -118,7 +118,7 @@ class Guidance:
         """Return whether the demand stays the same until something is asked for or decided."""
         if self._stopped or phase < _GROUND:
             return True
-        return phase is _AIR and self._flown.is_steady
+        return self._flown.is_steady and (phase is _AIR or not self._flown.lifts)
 
     def _ramped(self, demand: AnyDemand, time_us: int) -> AnyDemand:
         """Return a demand for a vehicle on the ground, its climb rate limited by the take-off ramp.

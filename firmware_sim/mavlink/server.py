@@ -230,6 +230,9 @@ class MavlinkServer:
         now_us, state = self._now_us, self._port.state()
         origin, before, last = state.origin, self._context.row, len(flown) - 1
         context = self._context.of(state)
+        if context is not before:
+            for client in self._all():
+                client.link.scheduler.quiet.clear()  # Home may be known now, or the pilot heard.
         payloads: Payloads = {}
         most = max(1, STREAMS_PER_TICK // (2 * len(due)))
         share = _share([len(names) for _, names in due])
