@@ -7,17 +7,20 @@ speed itself is left out: it delays a change of speed by a tenth of a second.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 from numba.extending import register_jitable
 
-from airl_mav.core.constants import US_PER_S
+from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S
+from airl_mav.core.frames import Vector
 from airl_mav.core.kernels import kernel
 from firmware_sim.autopilot.error_state import P
 from firmware_sim.autopilot.trajectory import braking_speed
 from firmware_sim.engine.record import (
     CLIMB_ENDED,
     NO_CLIMB,
+    RAMPING,
     RISING,
     SETTLING,
     Fields,
@@ -35,6 +38,10 @@ SETTLED_M = 0.01
 HEIGHT, SPEED, TARGET, HOME_DOWN, END, NEAR_GROUND = range(6)
 """Layout of `climb`: present height [m] and vertical speed, upwards positive [m/s]; the altitude;
 home, NED; where the take-off ends, and the next mode climbs on; up to where it climbs gently."""
+
+_BEGAN, _SPOOL_UP, _TAKES, _FROM, _UP_TO = range(5)
+"""Layout of `ramp`: when the spool-up began [µs], how long it and the ramp take [s], the first and
+the last speed of the ramp [m/s]."""
 
 _GENTLY, _UP, _DOWN = range(3)
 """Rows of `climb_limits`, each as `ClimbLimits`."""
@@ -72,10 +79,29 @@ def move_on(c: Fields, now_us: int) -> None:
 
 
 @kernel
+def ramp_m_s(ramp: Vector, now_us: int) -> float:
+    """Return the limit of the vertical speed of a vehicle on the ground [m/s].
+
+    Source: PX4's Takeoff: after COM_SPOOLUP_TIME it rises in MPC_TKO_RAMP_T from the value that
+    commands zero thrust to the take-off speed.
+    """
+    ramp_s = (now_us - ramp[_BEGAN]) / US_PER_S - ramp[_SPOOL_UP]
+    limit_m_s = ramp[_FROM]
+    if ramp_s > 0.0:
+        limit_m_s += min(1.0, ramp_s / ramp[_TAKES]) * (ramp[_UP_TO] - limit_m_s)
+    return float(limit_m_s)
+
+
+@kernel
 def climb_if_due(c: Fields) -> bool:
     """Let a climb change the demand when that is due; return whether the take-off has ended."""
     own = c.climb
-    if c.climbs not in (RISING, SETTLING) or c.time_us < c.climb_due_us:
+    if c.climbs not in (RAMPING, RISING, SETTLING) or c.time_us < c.climb_due_us:
+        return False
+    if c.climbs == RAMPING:
+        limit_m_s = ramp_m_s(c.ramp, c.time_us)
+        c.climb_due_us, c.demand[5] = c.time_us + DECIDE_US, max(-own[SPEED], -limit_m_s)
+        own[SPEED] = max(0.0, limit_m_s)
         return False
     if c.climbs == RISING:
         height_m = own[HOME_DOWN] - c.state[P + 2]
@@ -122,7 +148,7 @@ class Climb:
     @property
     def flies(self) -> bool:
         """Whether compiled ticks move it on."""
-        return self._record["climbs"].item(0) in (RISING, SETTLING)
+        return self._record["climbs"].item(0) in (RAMPING, RISING, SETTLING)
 
     @property
     def has_ended(self) -> bool:
@@ -136,6 +162,27 @@ class Climb:
     def stop(self, *, ended: bool = False) -> None:
         """Leave the demand to Python; `ended` = until its mode notices that it has ended."""
         self._record["climbs"] = CLIMB_ENDED if ended else NO_CLIMB
+
+    def ramp(
+        self, began_us: int, value: Callable[[str], float], time_us: int, *, flies: bool
+    ) -> float:
+        """Begin the climb anew at a time [µs] of the ramp on the ground; return its limit [m/s].
+
+        Args:
+            began_us: When the spool-up began [µs].
+            value: Looks up PX4 parameters by name.
+            time_us: Rises from call to call.
+            flies: Whether compiled ticks move it on from there.
+        """
+        ramp, record = self._record["ramp"][0], self._record
+        ramp[_BEGAN:_TAKES] = began_us, value("COM_SPOOLUP_TIME")
+        ramp[_TAKES] = max(value("MPC_TKO_RAMP_T"), 1e-3)
+        ramp[_FROM:] = -GRAVITY_M_S2 / value("MPC_Z_VEL_P_ACC"), value("MPC_TKO_SPEED")
+        record["climbs"] = RAMPING if flies else NO_CLIMB
+        record["climb_due_us"] = time_us + DECIDE_US
+        limit_m_s = ramp_m_s(ramp, time_us)
+        self.restart(max(0.0, limit_m_s))
+        return limit_m_s
 
     def aim(
         self,

@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable
 
 from airl_mav.control.demand import AnyDemand, AttitudeDemand, Demand, RateDemand
-from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S
 from airl_mav.core.frames import Vector
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.autopilot_state import Message, Mode, Severity
@@ -118,27 +117,23 @@ class Guidance:
         """Return whether the demand stays the same until something is asked for or decided."""
         if self._stopped or phase < _GROUND:
             return True
-        return self._flown.is_steady and (phase is _AIR or not self._flown.lifts)
+        if phase is _AIR or not self._flown.lifts:
+            return self._flown.is_steady
+        return self.context.climb.flies
 
     def _ramped(self, demand: AnyDemand, time_us: int) -> AnyDemand:
         """Return a demand for a vehicle on the ground, its climb rate limited by the take-off ramp.
 
-        PX4's Takeoff: after COM_SPOOLUP_TIME the vertical speed limit rises in MPC_TKO_RAMP_T
-        from the value that commands zero thrust to the take-off speed. A height becomes that rate.
+        A height becomes that rate.
         """
         if isinstance(demand, AttitudeDemand | RateDemand):
             return demand  # thrust is commanded: there is nothing to limit
         if self._spool_since_us is None:
             self._spool_since_us = time_us
-        value = self.context.value
-        elapsed_s = (time_us - self._spool_since_us) / US_PER_S
-        ramp_s = elapsed_s - value("COM_SPOOLUP_TIME")
-        limit = -GRAVITY_M_S2 / value("MPC_Z_VEL_P_ACC")
-        if ramp_s > 0.0:
-            share = min(1.0, ramp_s / max(value("MPC_TKO_RAMP_T"), 1e-3))
-            limit += share * (value("MPC_TKO_SPEED") - limit)
+        context = self.context
+        straight = self._flown is self._modes[Mode.TAKEOFF] and context.takeoff_place is None
         # Off the floor, the climb goes on from the ramp.
-        self.context.climb.restart(max(0.0, limit))
+        limit = context.climb.ramp(self._spool_since_us, context.value, time_us, flies=straight)
         (north, east, _), (vn, ve, vd) = demand.position, demand.velocity
         down = -limit if math.isnan(vd) else max(vd, -limit)
         return Demand((north, east, NAN), (vn, ve, down), demand.yaw, demand.yaw_rate)

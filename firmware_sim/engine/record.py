@@ -34,8 +34,9 @@ MAG, PRESSURE, GPS = 1, 2, 4
 IDLE, POSITION, TRAJECTORY, ATTITUDE, RATES = -1, 0, 1, 2, 3
 """Values of `demand_kind`: motors stopped, or the kind of demand (`control.demand`)."""
 
-NO_CLIMB, RISING, SETTLING, CLIMB_ENDED = range(4)
-"""Values of `climbs`: a take-off's climb up to near its altitude, or the rest of it in hold."""
+NO_CLIMB, RAMPING, RISING, SETTLING, CLIMB_ENDED = range(5)
+"""Values of `climbs`: the ramp of a take-off on the ground, its climb up to near its altitude, or
+the rest of it in hold."""
 
 OFF, TRUSTED, SUSPECT = 0, 1, 2
 """Values of `compass` and `gps`; Python judges every sample of a suspect one."""
@@ -200,6 +201,7 @@ CONTROLLER = np.dtype(
         ("climb_due_us", _I),
         ("climb", _F, 6),
         ("climb_limits", _F, (3, 3)),
+        ("ramp", _F, 5),
         # Land detector.
         ("detecting", _I),  # NOTHING, LIFT_OFF or LANDING
         ("detected", _I),  # 1 = it was detected in the newest tick

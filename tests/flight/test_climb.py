@@ -31,9 +31,7 @@ the floor: mean of two flights (`airl-sitl --firmware px4 --episodes 2`)."""
     acceleration=st.floats(0.2, 15.0),
     jerk=st.floats(1.0, 80.0),
 )
-def test_the_braking_speed_can_be_braked(
-    distance: float, acceleration: float, jerk: float
-) -> None:
+def test_the_braking_speed_can_be_braked(distance: float, acceleration: float, jerk: float) -> None:
     """v v / 2a at full deceleration, and 2 v a / jerk to build it up, fill the distance."""
     v = braking_speed(distance, acceleration, jerk)
     covered = v * v / (2.0 * acceleration) + 2.0 * v * acceleration / jerk

@@ -65,10 +65,9 @@ class Takeoff(FlightMode):
         # The trajectory stays where the vehicle is: it must not wait below the ground while the
         # thrust ramps up, nor be chased after it.
         climb = self._context.climb
-        aim(self._context)
-        climb.fly(RISING, time_us, self._context.height(state))
-        if self._context.standing:
-            climb.stop()
+        if not self._context.standing:
+            aim(self._context)
+            climb.fly(RISING, time_us, self._context.height(state))
         return over(self._place, -climb.speed_m_s)
 
     def _fly(self, state: Vector, time_us: int) -> AnyDemand:
