@@ -140,6 +140,18 @@ def pinned() -> int:
     return core
 
 
+class Repeats:
+    """A setpoint at 20 Hz, as lockstep repeats it between two ticks. Implements `Arrivals`."""
+
+    def __init__(self, autopilot: BuiltinAutopilot, setpoint: Setpoint, start_us: int) -> None:
+        self._autopilot, self._setpoint, self.next_us = autopilot, setpoint, float(start_us)
+
+    def arrive(self, tick_us: int) -> None:
+        while self.next_us <= tick_us:
+            self._autopilot.offer_setpoint(self._setpoint, tick_us)
+            self.next_us += SETPOINT_US
+
+
 def hover(
     vehicle: VehicleProfile,
     links: Sequence[Callable[[MemoryEndpoint], LinkConfig]],
@@ -167,19 +179,21 @@ def hover(
     if links:
         opened = [link(endpoint) for link, endpoint in zip(links, endpoints, strict=True)]
         server = MavlinkServer(opened, autopilot, boot_unix_us=0)
+    repeats = Repeats(autopilot, setpoint, simulation.time_us)
     begins()
     timer = Timer()
-    start_us = simulation.time_us
-    for i in range(round(flight_s * US_PER_S / SETPOINT_US)):
-        autopilot.offer_setpoint(setpoint, simulation.time_us)
-        while simulation.time_us < start_us + (i + 1) * SETPOINT_US:
-            if server is not None:
-                server.receive(simulation.time_us)
-            simulation.advance(start_us + (i + 1) * SETPOINT_US)
-            if server is not None:
-                server.send(simulation.time_us, simulation.flown)
-                for endpoint in endpoints:
-                    endpoint.take()
+    end_us = simulation.time_us + round(flight_s * US_PER_S)
+    while simulation.time_us < end_us:
+        repeats.arrive(simulation.time_us)
+        until_us: float = end_us
+        if server is not None:
+            server.receive(simulation.time_us)
+            until_us = min(end_us, server.next_send_us())
+        simulation.advance(until_us, repeats)
+        if server is not None:
+            server.send(simulation.time_us, simulation.flown)
+            for endpoint in endpoints:
+                endpoint.take()
     timed = timer.timed(flight_s)
     simulation.close()
     return timed

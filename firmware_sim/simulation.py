@@ -123,6 +123,7 @@ class Simulation:
         asked, nominal = setup.aircraft, Airframe.from_profile(setup.vehicle)
         wind = wind_of_episode(asked.wind, setup.seed)
         self.autopilot: FlightController = autopilot or builtin_autopilot(setup)
+        self._internals = self.autopilot.internals
         self.plant = Plant(
             setup.vehicle,
             setup.arena,
@@ -214,7 +215,7 @@ class Simulation:
         It may end earlier: when something is detected, or has to be decided. `arrivals` arrive
         between two of the ticks; None = nothing does.
         """
-        plant, recorder, autopilot = self.plant, self.recorder, self.autopilot.internals
+        plant, recorder, autopilot = self.plant, self.recorder, self._internals
         first_us, self.is_flying = self._clock.time_us(), True
         if self._logged > LOG_TICKS - MOST_TICKS:
             self._record()
@@ -223,11 +224,13 @@ class Simulation:
             plant.collisions.clear()
         else:
             recorder.before_controls()
-        if autopilot is None or not self._is_compiled(autopilot):
+        compiled = self._fly is self._unaltered and plant.compiled
+        if autopilot is None or not (compiled and autopilot.estimator.compiled):
             done = self._tick_by_python(autopilot)
+            self.time_us = plant.time_us
         else:
             done = self._stretch(autopilot, until_us, arrivals)
-        self.time_us, self.is_flying = plant.time_us, False
+        self.is_flying = False
         first, self._logged = self._logged, self._logged + done
         self.truths = self._truths[first : self._logged]
         self.flown = self._flown[first : first if autopilot is None else self._logged]
@@ -242,10 +245,6 @@ class Simulation:
         if self.recorder is not None:
             self.recorder.flown(self._truths[new], self._flown[new])
         self._recorded = self._logged
-
-    def _is_compiled(self, autopilot: BuiltinAutopilot) -> bool:
-        """Return whether compiled ticks fly as Python's do: no fault, no sensor beyond GPS."""
-        return self._fly is self._unaltered and self.plant.compiled and autopilot.compiled
 
     def _tick_by_python(self, autopilot: BuiltinAutopilot | None) -> int:
         """Fly a tick whose sample or commands are not the engine's; return 1."""
@@ -285,7 +284,7 @@ class Simulation:
             changed = autopilot.flown(plant.newest, event)
             self.time_us += TICK_US
             # After what Python fuses, other aids may be in use.
-            if changed or event in _ENDS or (event == FUSE and not autopilot.compiled):
+            if changed or event in _ENDS or (event == FUSE and not autopilot.estimator.compiled):
                 break
         return done
 

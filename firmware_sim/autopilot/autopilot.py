@@ -6,9 +6,10 @@ from collections.abc import Callable, Sequence
 
 from airl_mav.control.demand import AnyDemand, AttitudeDemand, RateDemand
 from airl_mav.control.gains import Gains
+from airl_mav.control.memory import ticks_to_motors
 from airl_mav.control.mixer import Motors
 from airl_mav.core.constants import TICK_HZ
-from airl_mav.core.frames import Geodetic
+from airl_mav.core.frames import Geodetic, Vector
 from firmware_sim.autopilot.auto_disarm import AutoDisarm
 from firmware_sim.autopilot.autopilot_state import (
     UNTOLD,
@@ -31,6 +32,7 @@ from firmware_sim.autopilot.commander import (
     Phase,
 )
 from firmware_sim.autopilot.error_filter import NewFilter
+from firmware_sim.autopilot.error_state import RATES, Q
 from firmware_sim.autopilot.estimator import Estimator
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.events.definition import Event as Told
@@ -103,13 +105,14 @@ class BuiltinAutopilot:
         self._auto_disarm = AutoDisarm(value)
         self._land_detector = LandDetector(value, record)
         self._controller = Controller(Gains.from_parameters(value), record)
+        self._memory: Vector = record["memory"][0]
         parameters.on_change(self._parameters_changed)
         self._messages: list[Message] = []
         self._demand: AnyDemand | None = None
         """What is being flown; None = the motors are stopped."""
         self._taken_us = -1
         """Time of the newest sample that the estimator has taken [µs]."""
-        self._due_us = 0
+        self._due_us: float = 0
         """When to decide again [µs]."""
         self._decided_on: tuple[Flight | None, object] = (None, None)
         """The commander's state and the setpoint that the newest decision is of."""
@@ -223,38 +226,48 @@ class BuiltinAutopilot:
 
     # --- compiled ticks
 
-    @property
-    def compiled(self) -> bool:
-        """Whether compiled ticks estimate and control as `step` does."""
-        return self.estimator.compiled
-
-    def decide_if_due(self) -> int:
+    def decide_if_due(self) -> float:
         """Decide where something is due or has arrived; return when to ask again [µs]."""
         flight, setpoint = self._decided_on
-        changed = (
-            flight is not self._commander.flight
-            or self._decided_healthy != self.record["healthy"].item(0)
-            or setpoint is not self._guidance.context.setpoint
-        )
+        changed = flight is not self._commander.flight or self._decided_healthy != self.record[
+            "healthy"
+        ].item(0)
         due_us = min(self._due_us, self.supervisor.next_us, self._navigator.due_us)
-        if changed or (self._taken_us >= due_us and not self._finds_nothing_new()):
+        due, follows = self._taken_us >= due_us, setpoint is self._guidance.context.setpoint
+        if not (changed or due or follows):
+            follows = self._follow()
+        if changed or not follows or (due and not self._finds_nothing_new()):
             self.decide()
             self._prepare()
             self._has_news = self._look_for_news()
         return self._taken_us if self._has_news else self._due_us
 
+    def _is_undisturbed(self) -> bool:
+        """Return whether the newest decision holds but for setpoints and looks."""
+        said = len(self._messages) + len(self._events) > self._unsaid
+        if said or not self._is_settled or self._manual_control.was_heard:
+            return False
+        return self._home.place is not None and not self._guidance.is_done(self._state)
+
+    def _follow(self) -> bool:
+        """Fly the newest setpoint if nothing else has changed; return whether that is done."""
+        guidance = self._guidance
+        if self.estimator.is_changed or not (guidance.is_steady(_AIR) and self._is_undisturbed()):
+            return False
+        self._demand = guidance.demand(self._state, _AIR, self._taken_us)
+        self._controller.command(self._demand)
+        self._decided_on = self._commander.flight, guidance.context.setpoint
+        return True
+
     def _finds_nothing_new(self) -> bool:
         """Return whether a look of the failsafes is all that is due, and changes nothing."""
         supervisor, flight = self.supervisor, self._commander.flight
-        said = len(self._messages) + len(self._events) > self._unsaid
-        if said or not (self._is_settled and self._is_idle()):
+        if not (self._is_undisturbed() and self._is_idle()):
             return False
         climb = self._guidance.context.climb
         if climb.has_ended or self._due_us == 0:
             return False
         self.record["climb_due_us"] = self._taken_us
-        if self._guidance.is_done(self._state):
-            return False
         if not supervisor.is_unchanged(self._taken_us, flight):
             return False
         self._commander.obey(NO_INTERVENTION)
@@ -409,9 +422,15 @@ class BuiltinAutopilot:
     # --- towards MAVLink (port.AutopilotPort)
 
     @property
+    def attitude(self) -> Vector:
+        """Estimate (4,) body -> NED."""
+        attitude: Vector = self._state[Q:RATES].copy()
+        return attitude
+
+    @property
     def ticks_to_motors(self) -> int:
         """After how many more ticks the motors reflect what is demanded in the next one."""
-        ticks, wanted = self._controller.ticks_to_motors, self._guidance.context.setpoint
+        ticks, wanted = ticks_to_motors(self._memory), self._guidance.context.setpoint
         if isinstance(wanted, RateDemand):
             return 0
         return min(1, ticks) if isinstance(wanted, AttitudeDemand) else ticks

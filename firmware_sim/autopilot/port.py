@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 from airl_mav.control.demand import AttitudeDemand, RateDemand
-from airl_mav.core.frames import Geodetic
+from airl_mav.core.frames import Geodetic, Vector
 from airl_mav.faults.kinds import Part
 from airl_mav.faults.model import Fault
 from firmware_sim.autopilot.autopilot_state import (
@@ -176,6 +176,11 @@ class AutopilotPort(Protocol):
 
     def state(self) -> AutopilotState:
         """Return the snapshot after the newest tick."""
+        ...
+
+    @property
+    def attitude(self) -> Vector:
+        """Estimate (4,) body -> NED."""
         ...
 
     def take_messages(self) -> list[Message]:

@@ -10,7 +10,6 @@ from airl_mav.control.memory import (
     butterworth,
     reset_integrals,
     settle_gyro_filter,
-    ticks_to_motors,
 )
 from airl_mav.control.mixer import Motors
 from airl_mav.core.constants import TICK_S
@@ -110,11 +109,6 @@ class Controller:
         """Newest motor commands 0..1."""
         a, b, c, d = self._motors.tolist()
         return a, b, c, d
-
-    @property
-    def ticks_to_motors(self) -> int:
-        """After how many more ticks the motors reflect what is demanded in the next one."""
-        return ticks_to_motors(self._memory)
 
     @property
     def thrust(self) -> float:

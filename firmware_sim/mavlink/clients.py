@@ -100,10 +100,10 @@ class Client:
         if self.context is not None:
             self.context.close()
 
-    def hear(self, message: WireMessage) -> None:
-        """Note whose message has come from this client."""
+    def hear(self, source: tuple[int, int]) -> None:
+        """Note whose message has come from this client: its system and component."""
         if len(self.components) < MAX_COMPONENTS:
-            self.components.add((message.get_srcSystem(), message.get_srcComponent()))
+            self.components.add(source)
 
 
 class Clients:
@@ -182,8 +182,8 @@ class Clients:
         """
         backlog, listening = self._backlog, self._listening
         arrivals = self.endpoint.arrivals()
-        listening.begin()
-        while listening.left():
+        bounded = listening.begin()
+        while not bounded or listening.left():
             if backlog:
                 yield backlog.popleft()
                 continue

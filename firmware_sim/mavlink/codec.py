@@ -182,41 +182,34 @@ class Encoder:
 
     def __init__(self, system_id: int = SYSTEM_ID, component_id: int = COMPONENT_ID) -> None:
         self._mav = dialect.MAVLink(None, srcSystem=system_id, srcComponent=component_id)
-        self._seq = 0
+        self.sequence = 0
+        """Sequence number of the next frame."""
         self._component_id = component_id
         self.identify(system_id)
 
     def identify(self, system_id: int) -> None:
         """Send as another system from now on. The sequence goes on."""
-        self._mav.srcSystem = system_id
+        self._mav.srcSystem = self.system_id = system_id
         self._ids = bytes([system_id, self._component_id])
-
-    @property
-    def system_id(self) -> int:
-        """System id of the sender."""
-        return self._ids[0]
-
-    sequence = property(lambda self: self._seq)
-    """Sequence number of the next frame."""
 
     def skip(self, frames: int) -> None:
         """Count frames that something else has packed."""
-        self._seq = (self._seq + frames) & 0xFF
+        self.sequence = (self.sequence + frames) & 0xFF
 
     def pack(self, message: WireMessage) -> bytes:
         """Return the frame of a message.
 
         Raises struct.error or OverflowError when a field does not fit its type.
         """
-        self._mav.seq = self._seq
+        self._mav.seq = self.sequence
         frame: bytes = message.pack(self._mav)
-        self._seq = (self._seq + 1) & 0xFF
+        self.sequence = (self.sequence + 1) & 0xFF
         return frame
 
     def frame(self, layout: Layout, payload: bytes) -> bytes:
         """Return the frame around a payload of that layout: what `pack` makes of the message."""
-        seq = self._seq
-        self._seq = (seq + 1) & 0xFF
+        seq = self.sequence
+        self.sequence = (seq + 1) & 0xFF
         covered = _HEADER_PACK(len(payload), 0, 0, seq, self._ids, layout.id_bytes) + payload
         return _MARK_V2 + covered + _checksum(covered + layout.crc_extra).to_bytes(2, "little")
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections import Counter
 
 from firmware_sim.mavlink.codec import WireMessage, dialect
-from firmware_sim.mavlink.services.context import sender
 
 COMMANDS = frozenset(
     (
@@ -38,14 +37,12 @@ class Senders:
         """System and component ids. They hold for as long as the links are open."""
         self._commands: Counter[tuple[int, int, str]] = Counter()
 
-    def note(self, message: WireMessage) -> None:
-        """Take a message that was for this vehicle and did something."""
-        kind = message.get_type()
-        if kind == "HEARTBEAT":
-            if message.type in ANNOUNCED:
-                self._announced.add(sender(message))
-        elif kind in COMMANDS:
-            self._commands[(*sender(message), kind)] += 1
+    def note(self, message: WireMessage, kind: str, source: tuple[int, int]) -> None:
+        """Take a message of a sender that was for this vehicle and did something."""
+        if kind in COMMANDS:
+            self._commands[(*source, kind)] += 1
+        elif kind == "HEARTBEAT" and message.type in ANNOUNCED:
+            self._announced.add(source)
 
     def strangers(self) -> tuple[str, ...]:
         """Return a line for each stranger and kind of message since the last `forget`.

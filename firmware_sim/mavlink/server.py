@@ -26,7 +26,7 @@ from firmware_sim.mavlink.own_streams import OwnStreams
 from firmware_sim.mavlink.radio import Radio
 from firmware_sim.mavlink.senders import Senders
 from firmware_sim.mavlink.services import handle, peers, send_pending
-from firmware_sim.mavlink.services.context import Context
+from firmware_sim.mavlink.services.context import Context, sender
 from firmware_sim.mavlink.services.transfers import RunningCalibration
 from firmware_sim.mavlink.streams import BUILDERS, Builder
 from firmware_sim.mavlink.streams.status import system_time
@@ -376,16 +376,17 @@ class MavlinkServer:
         }
 
     def _dispatch(self, client: Client, message: WireMessage) -> bool:
-        if (message.get_srcSystem(), message.get_srcComponent()) == (self._system_id, COMPONENT_ID):
-            return False  # an echo of our own message
-        if client.context is None:
+        source, context = sender(message), client.context
+        # What comes from the vehicle itself is an echo.
+        if source == (self._system_id, COMPONENT_ID) or context is None:
             return False
-        client.context.now_us = self._now_us
-        client.hear(message)
-        self._traffic.heard(client, bytes(message.get_msgbuf()))
-        effective = handle(message, client.context)
+        context.now_us = self._now_us
+        client.hear(source)
+        self._traffic.heard(client, message)
+        kind = message.get_type()
+        effective = handle(message, kind, context)
         if effective:
-            self._senders.note(message)
+            self._senders.note(message, kind, source)
         forwarded = self._forwarder.forward(message, client, self._system_id, self._now_us)
         return effective or forwarded
 

@@ -57,14 +57,15 @@ class ListeningTime:
         """Begin another tick: what arrives may take its time again."""
         self._left_us = LISTEN_US
 
-    def begin(self) -> None:
-        """Begin to listen; in another tick with another tick's time."""
+    def begin(self) -> bool:
+        """Begin to listen, in another tick with its own time; return whether that is bounded."""
         tick = self._tick
         if tick.clock is None:
-            return
+            return False
         if self._tick_us != tick.next_us:
             self._tick_us, self._left_us = tick.next_us, LISTEN_US
         self._looked_us = tick.clock.time_us()
+        return True
 
     def left(self) -> bool:
         """Count the time since the last look; return whether there is time for more."""

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 
 from firmware_sim.mavlink.clients import Client
+from firmware_sim.mavlink.codec import WireMessage
 from firmware_sim.mavlink.tlog import TlogWriter
 
 MAX_LOGS = 16
@@ -35,7 +36,7 @@ class TrafficLog:
             self._names[client.link.name] += 1
             self._tap(client, tlog)
 
-    def heard(self, client: Client, frame: bytes) -> None:
+    def heard(self, client: Client, message: WireMessage) -> None:
         """Note what a client has said: with its first frame its log begins."""
         main = self._main
         if main is None or client in self._logged or len(self._logged) > MAX_LOGS:
@@ -48,7 +49,7 @@ class TrafficLog:
         except OSError:
             self._main = None  # a full disk: the flight goes on, and no more logs are begun
             return
-        tlog.write(self._now_us(), frame)
+        tlog.write(self._now_us(), bytes(message.get_msgbuf()))
         self._tap(client, tlog)
 
     def end(self) -> None:

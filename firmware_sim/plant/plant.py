@@ -134,6 +134,7 @@ class Plant:
         self._flow = None
         if flow is not None:
             self._flow = PlantOpticalFlow(flow, arena, noise.spawn(1)[0], times, tick_s)
+        self._measures_compiled = fitted is None and flow is None and profile.sensors.vision is None
         model = PowerModel.from_profile(profile)
         self.rotor_lag = lag(airframe, tick_s)
         """Share of an error of its speed that a rotor keeps over a tick."""
@@ -232,12 +233,7 @@ class Plant:
     @property
     def compiled(self) -> bool:
         """Whether compiled ticks move and measure as `step` does."""
-        return (
-            self._sensors.compiled
-            and self._rangefinder is None
-            and self._flow is None
-            and isinstance(self.wind, Wind)
-        )
+        return self._measures_compiled and isinstance(self.wind, Wind)
 
     def glide(
         self, controller: Record, ticks: int, truths: Record, flown: Record

@@ -204,11 +204,6 @@ class SensorSuite:
         if profile.vision is not None:
             self._vision = _Vision(profile.vision, vision, times)
 
-    @property
-    def compiled(self) -> bool:
-        """Whether compiled ticks measure all that these sensors do."""
-        return self._vision is None
-
     def measure(self) -> None:
         """Measure what compiled ticks measure."""
         self.refill()

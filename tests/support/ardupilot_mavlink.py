@@ -148,7 +148,7 @@ class Manners:
         elif kind in ("PARAM_REQUEST_READ", "PARAM_REQUEST_LIST", "PARAM_SET"):
             self._parameter(kind, message, context)
         elif kind in ("TIMESYNC", "PING", "REQUEST_DATA_STREAM"):
-            handle(message, context)
+            handle(message, message.get_type(), context)
 
     def _command(self, number: int, params: list[float], context: Context) -> int:
         copter = self.copter

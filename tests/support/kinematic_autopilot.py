@@ -330,6 +330,10 @@ class KinematicAutopilot:
     def gcs_heartbeat(self, time_us: int) -> None:
         self.gcs_heartbeats.append(time_us)
 
+    @property
+    def attitude(self) -> Vector:
+        return quat_from_euler(self.roll, self.pitch, self.yaw)
+
     def state(self) -> KnownState:
         zero = np.zeros(3)
         estimate = Estimate(

@@ -239,10 +239,11 @@ class Watch:
 
     def _reported(self, now_us: int) -> tuple[object, ...]:
         reports, recovery, p = self.reports, self._estimator.recovery, self.settings
+        setpoint_us, manual_us, gcs_us = self._setpoint_us, self._manual_us, self._gcs_us
         return (
-            _silent(self._setpoint_us, now_us, p.com_of_loss_t),
-            _silent(self._manual_us, now_us, p.com_rc_loss_t),
-            _silent(self._gcs_us, now_us, p.com_dl_loss_t),
+            setpoint_us is None or now_us - setpoint_us > p.com_of_loss_t * US_PER_S,
+            manual_us is None or now_us - manual_us > p.com_rc_loss_t * US_PER_S,
+            gcs_us is None or now_us - gcs_us > p.com_dl_loss_t * US_PER_S,
             *(reports.fence, reports.mission_missing, reports.mission_failure),
             *(reports.navigator_failure, self.motors.failed, recovery.compass.given_up),
             *(recovery.consistency.restarts, self._estimator.compiled),

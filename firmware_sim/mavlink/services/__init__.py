@@ -81,9 +81,9 @@ HANDLERS: Mapping[str, tuple[Addressee, Handler]] = MappingProxyType(
 )
 
 
-def handle(message: WireMessage, context: Context) -> bool:
-    """Return whether a message was for this vehicle and did something; now it has."""
-    is_addressed, handler = HANDLERS.get(message.get_type(), (None, None))
+def handle(message: WireMessage, kind: str, context: Context) -> bool:
+    """Return whether a message of a kind was for this vehicle and did something; now it has."""
+    is_addressed, handler = HANDLERS.get(kind, (None, None))
     return bool(
         is_addressed and handler and is_addressed(message, context) and handler(message, context)
     )

@@ -40,12 +40,14 @@ def handle_local(message: WireMessage, context: Context) -> bool:
     """SET_POSITION_TARGET_LOCAL_NED."""
     mask, frame = message.type_mask, message.coordinate_frame
     velocity = _masked((message.vx, message.vy, message.vz), mask >> _VELOCITY_SHIFT)
-    acceleration = _masked((message.afx, message.afy, message.afz), mask >> _ACCELERATION_SHIFT)
+    acceleration = _NOTHING
+    if mask >> _ACCELERATION_SHIFT & 0b111 != 0b111:
+        acceleration = _masked((message.afx, message.afy, message.afz), mask >> _ACCELERATION_SHIFT)
     if frame == dialect.MAV_FRAME_LOCAL_NED:
         position = _masked((message.x, message.y, message.z), mask >> _POSITION_SHIFT)
     elif frame == dialect.MAV_FRAME_BODY_NED:
         position = _NOTHING
-        q = context.port.state().estimate.quaternion
+        q = context.port.attitude
         # All or nothing, as in PX4; a velocity turns with the heading alone.
         velocity = _NOTHING if mask >> _VELOCITY_SHIFT & 0b111 else _turned(velocity, q)
         if mask >> _ACCELERATION_SHIFT & 0b111:
@@ -132,7 +134,14 @@ def _offer(
     wire_yaw = message.yaw if math.isnan(yaw_rate) else yaw_rate
     wire = (message.vx, message.vy, message.vz, wire_yaw)
     context.port.offer_setpoint(
-        Setpoint(position, velocity, _finite(yaw), _finite(yaw_rate), wire, acceleration),
+        Setpoint(
+            position,
+            velocity,
+            yaw if math.isfinite(yaw) else math.nan,
+            yaw_rate if math.isfinite(yaw_rate) else math.nan,
+            wire,
+            acceleration,
+        ),
         context.now_us,
     )
     context.refusals.clear()
