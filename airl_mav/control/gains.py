@@ -6,12 +6,7 @@ import math
 from collections.abc import Callable
 from typing import Annotated, NamedTuple, get_origin, get_type_hints
 
-import numpy as np
-from numba.np.unsafe.ndarray import to_fixed_tuple
-from numpy.typing import NDArray
-
 from airl_mav.core.constants import DEG
-from airl_mav.core.kernels import kernel
 
 
 class Gains(NamedTuple):
@@ -100,17 +95,3 @@ def _allocation(forward: float, right: float) -> tuple[float, float]:
     if weaker <= LEAST_ARM * max(forward, right):
         return math.sqrt(0.5), math.sqrt(0.5)
     return math.sqrt(0.5) * weaker / right, math.sqrt(0.5) * weaker / forward
-
-
-_COUNT = len(Gains._fields)
-
-
-def pack(gains: Gains) -> NDArray[np.float64]:
-    """Return the gains as a row of floats, which numba passes faster than a tuple."""
-    return np.array(gains, np.float64)
-
-
-@kernel
-def unpack(row: NDArray[np.float64]) -> Gains:
-    """Return the gains of a row by their names. The inverse of `pack`, for compiled code."""
-    return Gains(*to_fixed_tuple(row, _COUNT))

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from airl_mav.control.cascade import filters
 from airl_mav.control.demand import AnyDemand, AttitudeDemand, Demand, TrajectoryDemand
-from airl_mav.control.gains import Gains, pack
-from airl_mav.control.memory import (
-    butterworth,
-    reset_integrals,
-    settle_gyro_filter,
-)
+from airl_mav.control.gains import Gains
+from airl_mav.control.memory import reset_integrals, settle_gyro_filter
 from airl_mav.control.mixer import Motors
 from airl_mav.core.constants import TICK_S
 from airl_mav.core.frames import Vector
@@ -52,7 +49,7 @@ class Controller:
         self._wanted, self._output = record["demand"][0], record["output"][0]
         self._memory, self._motors = record["memory"][0], record["motors"][0]
         self._gyro_cutoff_hz = gains.gyro_cutoff_hz
-        record["gains"] = pack(gains)
+        self._keep(gains)
         self.rest()
 
     def set_gains(self, gains: Gains) -> None:
@@ -61,9 +58,13 @@ class Controller:
         if cutoff_hz != self._gyro_cutoff_hz:
             # The delay elements are scaled by the cut-off: left as they are, a much higher one
             # would multiply the measured rates.
-            settle_gyro_filter(self._memory, butterworth(cutoff_hz, TICK_S))
+            settle_gyro_filter(self._memory, filters(gains, TICK_S).gyro)
             self._gyro_cutoff_hz = cutoff_hz
-        self._record["gains"] = pack(gains)
+        self._keep(gains)
+
+    def _keep(self, gains: Gains) -> None:
+        velocity, gyro, dgyro, yaw = filters(gains, TICK_S)
+        self._record["gains"], self._record["filters"] = tuple(gains), (velocity, *gyro, dgyro, yaw)
 
     def command(self, demand: AnyDemand | None) -> None:
         """Take what the coming ticks fly; None = stop the motors."""

@@ -47,6 +47,9 @@ NOTHING, LIFT_OFF, LANDING = 0, 1, 2
 DEMAND_SIZE = 11
 """Numbers in the largest demand."""
 
+FILTERS_SIZE = 8
+"""Numbers in the low-pass filters of the control loops."""
+
 OUTPUT_SIZE = 11
 """Setpoints of the control loops: attitude (4), rates (3), velocity (3), thrust."""
 
@@ -189,7 +192,8 @@ CONTROLLER = np.dtype(
         ("yaw_accel", _F, 3 * LONGEST),
         ("yaw_count", _I),
         # Control.
-        ("gains", _F, len(Gains._fields)),
+        ("gains", [(name, _F) for name in Gains._fields]),
+        ("filters", _F, FILTERS_SIZE),  # `cascade.filters` of the gains
         ("memory", _F, MEMORY_SIZE),
         ("demand_kind", _I),
         ("demand", _F, DEMAND_SIZE),

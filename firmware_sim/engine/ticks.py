@@ -15,15 +15,15 @@ import numpy as np
 from numba.extending import register_jitable
 
 from airl_mav.control.cascade import (
+    Filters,
     Output,
     attitude_tick,
     cascade_tick,
-    filters,
     rate_tick,
     trajectory_tick,
 )
 from airl_mav.control.demand import AttitudeDemand, Demand, RateDemand, TrajectoryDemand
-from airl_mav.control.gains import unpack
+from airl_mav.control.memory import Biquad
 from airl_mav.core.constants import GRAVITY_M_S2, TICK_S, US_PER_S
 from airl_mav.core.frames import (
     HOME,
@@ -151,8 +151,8 @@ def control(c: Fields) -> None:
         for i in range(4):
             c.motors[i] = 0.0
         return
-    gains = unpack(c.gains)
-    weights = filters(gains, TICK_S)
+    gains, f = c.gains, c.filters
+    weights = Filters(f[0], Biquad(f[1], f[2], f[3], f[4], f[5]), f[6], f[7])
     p, v = (s[0], s[1], s[2]), (s[3], s[4], s[5])
     q, w = (s[6], s[7], s[8], s[9]), (s[10], s[11], s[12])
     if kind == POSITION:
