@@ -153,7 +153,7 @@ class Climb:
     @property
     def has_ended(self) -> bool:
         """Whether they have brought it to its end, which its mode has not noticed yet."""
-        return self._record["climbs"].item(0) == CLIMB_ENDED
+        return bool(self._record["climbs"].item(0) == CLIMB_ENDED)
 
     def restart(self, speed_m_s: float) -> None:
         """Continue from a vertical speed [m/s]."""

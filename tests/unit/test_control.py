@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from airl_mav.control.attitude import attitude_setpoint, rate_control, rate_setpoint
 from airl_mav.control.cascade import Output, cascade_tick, filters
 from airl_mav.control.demand import Demand
-from airl_mav.control.gains import Gains, pack, unpack
+from airl_mav.control.gains import Gains
 from airl_mav.control.memory import (
     Biquad,
     butterworth,
@@ -624,11 +624,6 @@ def test_a_row_of_a_batch_is_one_vehicle() -> None:
     assert not many[[0, 2]].any()
     reset_integrals(many[1])
     assert np.count_nonzero(many[1]) < np.count_nonzero(one)
-
-
-def test_gains_cross_over_whole() -> None:
-    assert len(set(pack(GAINS))) > 20
-    assert unpack(pack(GAINS)) == GAINS
 
 
 @given(triples, triples, quaternions, triples, triples, triples, angles)
