@@ -29,11 +29,23 @@ before, and TIMESYNC, whose answer the vehicle is not sent (`inbound`). Answers,
 slow streams, as HEARTBEAT, are not among them."""
 
 
+UNREAD = frozenset(
+    layout(name).id_bytes
+    for name in (
+        *("HIGHRES_IMU", "ODOMETRY", "ALTITUDE", "ATTITUDE_TARGET", "SERVO_OUTPUT_RAW", "VFR_HUD"),
+        *("POSITION_TARGET_LOCAL_NED", "POSITION_TARGET_GLOBAL_INT", "ESC_INFO", "ESC_STATUS"),
+    )
+)
+"""Messages of which the companion never asks MAVSDK."""
+
+
 def newest(frames: Sequence[bytes]) -> list[bytes]:
-    """Return the frames without the `STATES` that a later frame of the same sender replaces."""
+    """Return the frames that are read: without `UNREAD`, and of each of the `STATES` the newest."""
     kept: list[bytes] = []
     replaced: set[bytes] = set()
     for frame in reversed(frames):
+        if frame[_MESSAGE] in UNREAD:
+            continue
         if frame[_MESSAGE] in STATES:
             sent_by = frame[_SENT_BY]
             if sent_by in replaced:
