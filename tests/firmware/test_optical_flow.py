@@ -30,7 +30,7 @@ from firmware_sim.external.px4 import hil_messages as hil
 from firmware_sim.flight_log import values
 from firmware_sim.interfaces import FlowReading, SensorSample
 from firmware_sim.mavlink.codec import Encoder, layout
-from firmware_sim.mavlink.streams.optical_flow import optical_flow_rad
+from firmware_sim.mavlink.streams.distance import optical_flow_rad
 from firmware_sim.mavlink.telemetry import payload
 from firmware_sim.plant.optical_flow import BEST, INVALID, PlantOpticalFlow
 from tests.support import mavlink_clients

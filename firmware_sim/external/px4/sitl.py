@@ -19,7 +19,7 @@ from firmware_sim.external.transport.tcp_port import WATCH_S, TcpPort
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
 from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth
 from firmware_sim.mavlink.codec import Decoder, Encoder, WireMessage, dialect
-from firmware_sim.mavlink.streams.ground_truth import hil_state_quaternion
+from firmware_sim.mavlink.streams.pose import hil_state_quaternion
 
 ANSWER_S = 5.0
 """Longest wait for an answer [wall s]."""

@@ -33,7 +33,7 @@ from firmware_sim.mavlink.services.context import (
     sender,
 )
 from firmware_sim.mavlink.services.navigation_commands import local_place
-from firmware_sim.mavlink.streams.flight_modes import KNOWN
+from firmware_sim.mavlink.streams.information import KNOWN
 from firmware_sim.mavlink.streams.units import INT32_MAX
 
 FORCE_MAGIC = 21_196
