@@ -33,8 +33,7 @@ MISSION_DENIED = critical(
 MODE_NOT_AVAILABLE = critical(
     "commander_modeswitch_not_avail",
     "Switching to mode '{2}' is currently not possible",
-    "uint32_t mavlink_mode",
-    "navigation_mode_t mode",
+    "uint32_t mavlink_mode, navigation_mode_t mode",
     kind=_APPENDED,
 )
 PILOT_TOOK_OVER = define("commander_rc_override", "Pilot took over using sticks")
@@ -51,25 +50,21 @@ _LAND_AND_CHECK = "Land immediately and check the system."
 IMU_FAILED = define(
     "sensor_failover",
     "{1} sensor #{2} failure: {3}",
-    "sensor_type_t sensor_type",
-    "uint8_t failover_index",
-    "sensor_failover_reason_t failover_reason",
+    "sensor_type_t sensor_type, uint8_t failover_index, sensor_failover_reason_t failover_reason",
     level=Level.EMERGENCY,
     description=_LAND_AND_CHECK,
 )
 MAG_FAILED = define(
     "sensor_failover_mag",
     "Magnetometer sensor #{1} failure: {2}",
-    "uint8_t failover_index",
-    "sensor_failover_reason_t failover_reason",
+    "uint8_t failover_index, sensor_failover_reason_t failover_reason",
     level=Level.EMERGENCY,
     description=_LAND_AND_CHECK,
 )
 BARO_FAILED = define(
     "sensor_failover_baro",
     "Baro sensor #{1} failure: {2}",
-    "uint8_t failover_index",
-    "sensor_failover_reason_t failover_reason",
+    "uint8_t failover_index, sensor_failover_reason_t failover_reason",
     level=Level.EMERGENCY,
     description=_LAND_AND_CHECK,
 )
@@ -103,8 +98,7 @@ MISSION_CLIMB = define(
 RTL_RETURN_AT = define(
     "vrtl_return_at",
     "RTL: start return at {1m_v} ({2m_v} above destination)",
-    "int32_t rtl_alt",
-    "int32_t rtl_alt_above_destination",
+    "int32_t rtl_alt, int32_t rtl_alt_above_destination",
 )
 RTL_MISSION_LAND = define(
     "rtl_mission_land_climb", "RTL Mission Land: climb to {1m_v}", "int32_t rtl_alt"
@@ -117,18 +111,13 @@ _failsafe = partial(define, level=Level.CRITICAL, internal=Level.WARNING)
 FAILSAFE_HOLD_GENERIC = _failsafe(
     "commander_failsafe_enter_generic_hold",
     "Failsafe activated: switching to {2} in {3} seconds",
-    "uint32_t mavlink_mode",
-    "failsafe_action_t action",
-    "uint16_t delay_s",
+    "uint32_t mavlink_mode, failsafe_action_t action, uint16_t delay_s",
     kind=_APPENDED,
 )
 FAILSAFE_HOLD = _failsafe(
     "commander_failsafe_enter_hold",
     "{4}: switching to {2} in {3} seconds",
-    "uint32_t mavlink_mode",
-    "failsafe_action_t action",
-    "uint16_t delay_s",
-    "failsafe_cause_t cause",
+    "uint32_t mavlink_mode, failsafe_action_t action, uint16_t delay_s, failsafe_cause_t cause",
 )
 FAILSAFE_WARN_GENERIC = define(
     "commander_failsafe_enter_generic_warn",
@@ -141,16 +130,14 @@ FAILSAFE_WARN_GENERIC = define(
 FAILSAFE_DISENGAGED = _failsafe(
     "commander_failsafe_enter_autopilot_disengaged",
     "Failsafe activated: Autopilot disengaged, switching to {2}",
-    "uint32_t mavlink_mode",
-    "failsafe_action_t action",
+    "uint32_t mavlink_mode, failsafe_action_t action",
     description="The vehicle no longer holds its position.",
     kind=_APPENDED,
 )
 FAILSAFE_GENERIC = _failsafe(
     "commander_failsafe_enter_generic",
     "Failsafe activated: switching to {2}",
-    "uint32_t mavlink_mode",
-    "failsafe_action_t action",
+    "uint32_t mavlink_mode, failsafe_action_t action",
     kind=_APPENDED,
 )
 FAILSAFE_BATTERY_LOW = warning(
@@ -171,15 +158,12 @@ FAILSAFE_TIME_LOW = warning(
 FAILSAFE_WARN = define(
     "commander_failsafe_enter_warn",
     "Failsafe warning: {2}",
-    "uint32_t mavlink_mode",
-    "failsafe_cause_t cause",
+    "uint32_t mavlink_mode, failsafe_cause_t cause",
     level=Level.WARNING,
     description="No action is triggered.",
 )
 FAILSAFE = _failsafe(
     "commander_failsafe_enter",
     "{3}: switching to {2}",
-    "uint32_t mavlink_mode",
-    "failsafe_action_t action",
-    "failsafe_cause_t cause",
+    "uint32_t mavlink_mode, failsafe_action_t action, failsafe_cause_t cause",
 )

@@ -6,11 +6,17 @@ navigator/mission_feasibility_checker.cpp, navigator/geofence.cpp, mavlink/mavli
 
 from __future__ import annotations
 
-from firmware_sim.autopilot.events.definition import Definition, Level, define, error, warning
+from firmware_sim.autopilot.events.definition import (
+    Definition,
+    Level,
+    define,
+    error,
+    warning,
+)
 
 
-def _rejected(name: str, words: str, *listed: str, internal: Level = Level.INFO) -> Definition:
-    return define(name, f"Mission rejected: {words}", *listed, level=Level.ERROR, internal=internal)
+def _rejected(name: str, words: str, listed: str = "", internal: Level = Level.INFO) -> Definition:
+    return define(name, f"Mission rejected: {words}", listed, level=Level.ERROR, internal=internal)
 
 
 def _transfer(name: str, message: str, level: Level = Level.ERROR) -> Definition:
@@ -23,7 +29,7 @@ NO_POSITION = define("navigator_mis_no_pos_lock", "Not yet ready for mission, no
 UNSUPPORTED_COMMAND = _rejected(
     "navigator_mis_unsup_cmd",
     "item {1}: unsupported command: {2}",
-    *("uint16_t item", "uint16_t nav_cmd"),
+    "uint16_t item, uint16_t nav_cmd",
     internal=Level.WARNING,
 )
 STARTS_WITH_LANDING = _rejected("navigator_mis_starts_w_landing", "starts with landing")
