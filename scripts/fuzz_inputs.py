@@ -51,7 +51,7 @@ from companion.camera import ZmqFrameSource
 from companion.pilot import OLDEST_FRAME_US, age_of
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.parameter_store import Parameters
-from firmware_sim.external.bridge import no_process
+from firmware_sim.external.launcher import no_process
 from firmware_sim.external.parameter_file import qgroundcontrol_file
 from firmware_sim.external.px4.sitl import EPOCH_US, Px4Bridge
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError

@@ -28,8 +28,7 @@ from firmware_sim.engine.kinematics import (
     from_bullet,
 )
 from firmware_sim.plant.body import NOTHING, Touch
-from firmware_sim.plant.bullet import pybullet
-from firmware_sim.plant.world import World, WorldState
+from firmware_sim.plant.world import World, WorldState, pybullet
 
 _ANY_LINK = -2
 """pybullet's filter of contacts that lets all links pass."""

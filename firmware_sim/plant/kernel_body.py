@@ -20,11 +20,15 @@ from firmware_sim.engine.kinematics import WIDTH, quaternion, rates, velocity, w
 from firmware_sim.plant.body import FLOOR, NOTHING, Touch
 from firmware_sim.plant.contacts.box import BREAKING_SHARE, MOST, ROW
 from firmware_sim.plant.contacts.convex import touch_obstacle
-from firmware_sim.plant.contacts.floor import FLOOR_ID, KEPT, touch_floor
-from firmware_sim.plant.contacts.ground import near_ground, touch_ground
+from firmware_sim.plant.contacts.ground import (
+    FLOOR_ID,
+    KEPT,
+    near_ground,
+    touch_floor,
+    touch_ground,
+)
 from firmware_sim.plant.contacts.solver import resolve
-from firmware_sim.plant.solids import Solids, greatest_speed, room_among, solids_of
-from firmware_sim.plant.tours import place_at
+from firmware_sim.plant.solids import Solids, greatest_speed, place_at, room_among, solids_of
 
 _FIRST = FLOOR_ID + 1
 """Number of the first wall or obstacle."""

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from airl_mav.core.frames import Geodetic
 from firmware_sim.autopilot.autopilot_state import Message, Severity
-from firmware_sim.autopilot.events import mission_events as events
+from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.events.definition import Definition
 from firmware_sim.autopilot.navigation.plan import NavCommand, PlanItem, distance_m
 

@@ -17,7 +17,7 @@ import numpy as np
 from airl_mav.core.frames import Geodetic, local_to_geodetic
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.autopilot_state import FenceStatus, Message, Mode, Severity
-from firmware_sim.autopilot.events import mission_events as events
+from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.events.definition import Definition
 from firmware_sim.autopilot.navigation.flown_item import Situation
 from firmware_sim.autopilot.navigation.plan import Kind, NavCommand, PlanItem, Plans, distance_m

@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 from airl_mav.core.clock import Patience, WallClock
 from airl_mav.core.constants import TICK_HZ, TICK_US, US_PER_S
-from firmware_sim.external.bridge import no_process
+from firmware_sim.external.launcher import no_process
 from firmware_sim.external.process import RunningProgram, program_at
 from firmware_sim.external.px4 import hil_messages as hil
 from firmware_sim.external.px4.program import MODEL, SIMULATOR_PORT, UNAWAITED_THREADS
