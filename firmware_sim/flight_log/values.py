@@ -9,7 +9,8 @@ from typing import NamedTuple
 from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.core.frames import Vector, local_to_geodetic, quat_yaw
 from airl_mav.vehicle import atmosphere
-from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Landed, Mode
+from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Landed
+from firmware_sim.autopilot.mode_numbers import NAVIGATION_STATES
 from firmware_sim.autopilot.optical_flow import (
     GREATEST_HEIGHT_M,
     GREATEST_RAD_S,
@@ -17,26 +18,6 @@ from firmware_sim.autopilot.optical_flow import (
 )
 from firmware_sim.flight_log.ulog import Values
 from firmware_sim.interfaces import PoseFrame, Truth, VelocityFrame
-
-NAVIGATION_STATES: dict[Mode, int] = {
-    Mode.MANUAL: 0,
-    Mode.ALTITUDE: 1,
-    Mode.POSITION: 2,
-    Mode.MISSION: 3,
-    Mode.HOLD: 4,
-    Mode.RETURN: 5,
-    Mode.ACRO: 10,
-    Mode.DESCEND: 12,
-    Mode.TERMINATION: 13,
-    Mode.OFFBOARD: 14,
-    Mode.STABILIZED: 15,
-    Mode.TAKEOFF: 17,
-    Mode.LAND: 18,
-    Mode.FOLLOW: 19,
-    Mode.PRECISION_LAND: 20,
-    Mode.ORBIT: 21,
-}
-"""VehicleStatus.nav_state (NAVIGATION_STATE_*) of each mode."""
 
 DISARMED, ARMED = 1, 2
 """VehicleStatus.arming_state."""

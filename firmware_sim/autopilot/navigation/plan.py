@@ -70,6 +70,18 @@ class NavCommand(IntEnum):
     DO_WINCH = 42600
 
 
+NOT_IN_MISSIONS = frozenset(
+    {
+        NavCommand.FENCE_POLYGON_VERTEX_INCLUSION,
+        NavCommand.FENCE_POLYGON_VERTEX_EXCLUSION,
+        NavCommand.FENCE_CIRCLE_INCLUSION,
+        NavCommand.FENCE_CIRCLE_EXCLUSION,
+        NavCommand.RALLY_POINT,
+    }
+)
+"""Points of a fence and rally points."""
+
+
 class Frame(IntEnum):
     """MAV_FRAME of plan items."""
 

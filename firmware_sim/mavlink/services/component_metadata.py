@@ -23,8 +23,8 @@ from firmware_sim.autopilot.events.definition import Definition, sub_id
 from firmware_sim.autopilot.events.enumerations import ENUMERATIONS, Enumeration, ModeGroup, words
 from firmware_sim.autopilot.mode_numbers import STATE_BITS, custom_mode
 from firmware_sim.mavlink.codec import dialect
-from firmware_sim.mavlink.crc32 import crc32part
 from firmware_sim.mavlink.services.context import Command, Context
+from firmware_sim.mavlink.services.transfers import crc32part
 from firmware_sim.mavlink.streams.units import boot_ms
 from firmware_sim.storage import Storage
 

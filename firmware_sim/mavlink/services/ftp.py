@@ -14,10 +14,11 @@ from airl_mav.core.constants import US_PER_S
 from firmware_sim.mavlink.codec import WireMessage
 from firmware_sim.mavlink.services import component_metadata
 from firmware_sim.mavlink.services.context import Context, sender
-from firmware_sim.mavlink.services.ftp_files import DATA_BYTES, OPERATIONS, Checksum, read_at
+from firmware_sim.mavlink.services.ftp_files import DATA_BYTES, OPERATIONS, read_at
 from firmware_sim.mavlink.services.transfers import (
     SESSION,
     Burst,
+    Checksum,
     Code,
     RefusedError,
     Request,

@@ -9,8 +9,8 @@ import struct
 from firmware_sim.autopilot.autopilot_state import Arming, Result
 from firmware_sim.autopilot.port import ParameterStore, ParameterValue
 from firmware_sim.mavlink.codec import WireMessage, dialect, param_value, payload
-from firmware_sim.mavlink.crc32 import crc32part
 from firmware_sim.mavlink.services.context import Action, Command, Context, sender
+from firmware_sim.mavlink.services.transfers import crc32part
 
 HASH_NAME = "_HASH_CHECK"
 """Pseudo parameter: a checksum by which a ground station recognises its cached values."""
