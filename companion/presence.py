@@ -46,7 +46,6 @@ class Sender(Protocol):
 
     def send_message(self, name: str, fields: Mapping[str, Any]) -> bool:
         """Send a message by its name and fields; return whether it was sent."""
-        ...
 
 
 def computer_status(
@@ -117,7 +116,6 @@ class Vehicle(Sender, Protocol):
 
     def kinematics(self) -> Kinematics:
         """Return the newest position, velocity and attitude."""
-        ...
 
 
 def obstacle_distance(

@@ -31,11 +31,9 @@ class Arrivals(Protocol):
     @property
     def next_us(self) -> float:
         """Simulated time of the next one [µs]; inf = none."""
-        ...
 
     def arrive(self, tick_us: int) -> None:
         """Let the flight controller receive everything up to simulated `tick_us` [µs]."""
-        ...
 
 
 class Pacing(Protocol):
@@ -47,40 +45,33 @@ class Pacing(Protocol):
     @property
     def clock(self) -> Clock:
         """Simulated time; between ticks it advances only where it is paced by the wall clock."""
-        ...
 
     @property
     def epoch_ns(self) -> int | None:
         """Host monotonic time of simulated time 0 [ns]; None when it is not paced."""
-        ...
 
     @property
     def quiet_until_us(self) -> float:
         """Simulated time before which only `arrivals` can arrive [µs]; 0 = at any tick."""
-        ...
 
     @property
     def arrivals(self) -> Arrivals | None:
         """Messages that arrive before then; None = none."""
-        ...
 
     def restart(self, tick_us: int) -> None:
         """Declare that it is simulated `tick_us` now: time before that belongs to no episode."""
-        ...
 
     def wait(self, tick_us: int, sockets: Sequence[int], readable: Callable[[int], object]) -> int:
         """Wait until simulated `tick_us` is due and return the time then [µs].
 
         When a socket becomes readable before, `readable` is called with the time of that.
         """
-        ...
 
     def read_by(self, began_us: int) -> int:
         """Return a time by which what was just read had arrived, reading began at `began_us` [µs].
 
         Never before `began_us`, nor before a time that was handed out.
         """
-        ...
 
 
 class WallPacing:

@@ -286,184 +286,147 @@ class AutopilotState(Protocol):
     @property
     def time_us(self) -> int:
         """Simulated time of the tick [µs]."""
-        ...
 
     @property
     def settled(self) -> object:
         """The same object as long as nothing has changed that a tick's log lacks; None = it may."""
-        ...
 
     @property
     def estimate(self) -> Estimate:
         """The estimator's output."""
-        ...
 
     @property
     def status(self) -> CommanderStatus:
         """What the commander reports."""
-        ...
 
     @property
     def setpoint(self) -> Setpoint:
         """What the controller tracks (in every mode)."""
-        ...
 
     @property
     def attitude_setpoint(self) -> Vector:
         """(4,) body -> NED."""
-        ...
 
     @property
     def rate_setpoint(self) -> Vector:
         """(3,) FRD [rad/s]."""
-        ...
 
     @property
     def thrust_setpoint(self) -> float:
         """Collective, 0..1."""
-        ...
 
     @property
     def motors(self) -> tuple[float, float, float, float]:
         """Commands of the motors, 0..1."""
-        ...
 
     @property
     def accel(self) -> Vector:
         """(3,) newest raw sample, FRD [m/s²]."""
-        ...
 
     @property
     def gyro(self) -> Vector:
         """(3,) newest raw sample, FRD [rad/s]."""
-        ...
 
     @property
     def mag(self) -> Vector:
         """(3,) newest raw sample, FRD [gauss]."""
-        ...
 
     @property
     def pressure_hpa(self) -> float:
         """Newest static pressure [hPa]."""
-        ...
 
     @property
     def temperature_c(self) -> float:
         """Of the air [°C]."""
-        ...
 
     @property
     def battery(self) -> BatterySample:
         """What the power module reports."""
-        ...
 
     @property
     def gps(self) -> GpsFix | None:
         """Newest fix; None before the first."""
-        ...
 
     @property
     def home(self) -> Geodetic | None:
         """Set when the estimator's origin is set and at arming; None before."""
-        ...
 
     @property
     def origin(self) -> Geodetic | None:
         """The point of the globe where local NED is zero; None before the first fix."""
-        ...
 
     @property
     def load(self) -> float:
         """Share of the tick spent computing, 0..1."""
-        ...
 
     @property
     def armed_us(self) -> int:
         """When it was armed [µs], 0 while it is not."""
-        ...
 
     @property
     def takeoff_us(self) -> int:
         """When it left the ground [µs], 0 before."""
-        ...
 
     @property
     def mission(self) -> MissionProgress:
         """How far the mission has come."""
-        ...
 
     @property
     def fence(self) -> FenceStatus:
         """Which limits of the geofence are violated."""
-        ...
 
     @property
     def orbit(self) -> OrbitStatus | None:
         """The circle that is flown, in Orbit mode."""
-        ...
 
     @property
     def health(self) -> Health:
         """What can be believed and used."""
-        ...
 
     @property
     def hover_thrust(self) -> float:
         """Collective that hovers, 0..1."""
-        ...
 
     @property
     def destination(self) -> tuple[float, float, float] | None:
         """Where an automatic mode is going, local NED [m]; None in other modes."""
-        ...
 
     @property
     def home_yaw(self) -> float:
         """Heading at home [rad]."""
-        ...
 
     @property
     def sticks(self) -> Sticks | None:
         """A pilot's; None = none are heard."""
-        ...
 
     @property
     def esc_outputs(self) -> tuple[float, float, float, float] | None:
         """What the speed controllers report that their motors do; None: what they are told."""
-        ...
 
     @property
     def odometry(self) -> Odometry | None:
         """The newest pose that something else has estimated; None before any."""
-        ...
 
     @property
     def odometry_us(self) -> int:
         """When it was told [µs]."""
-        ...
 
     @property
     def distance(self) -> DistanceReading | None:
         """The newest of a distance sensor; None before any."""
-        ...
 
     @property
     def distance_us(self) -> int:
         """When it came [µs]."""
-        ...
 
     @property
     def flow(self) -> FlowReading | None:
         """The newest of an optical flow sensor; None before any."""
-        ...
 
     @property
     def flow_us(self) -> int:
         """When it came [µs]."""
-        ...
 
     @property
     def clearance(self) -> Clearance | None:
         """How far the ground is below; None before the first range."""
-        ...

@@ -23,11 +23,9 @@ class Keeper(Protocol):
 
     def read(self) -> Mapping[str, int | float]:
         """Return what is kept. Raises UsageError when it cannot be read."""
-        ...
 
     def write(self, values: Mapping[str, int | float]) -> None:
         """Keep these instead. Raises OSError when they cannot be written."""
-        ...
 
 
 class Parameters:

@@ -39,7 +39,6 @@ class Bridge(Protocol):
             FirmwareMissingError: It did not connect in time.
             FirmwareLostError: From `alive`.
         """
-        ...
 
     def step(self, sample: SensorSample) -> ActuatorControls:
         """Send a tick's sensors; return the motor commands until the next tick.
@@ -48,15 +47,12 @@ class Bridge(Protocol):
             FirmwareLostError: The firmware died, hangs, or sends invalid data.
             FirmwareMissingError: It is connected, but cannot be flown.
         """
-        ...
 
     def use_truth(self, truth: Callable[[], Truth]) -> None:
         """Accept a source of the true state."""
-        ...
 
     def close(self) -> None:
         """Release what it holds; harmless when called again."""
-        ...
 
 
 class Launcher:

@@ -137,7 +137,6 @@ class Effect(Protocol):
 
     def __call__(self, value: Any, time_us: int) -> Any:
         """Return what is measured instead of `value` at a time; None: nothing is, in this tick."""
-        ...
 
 
 def _off(value: Any, time_us: int) -> None:

@@ -110,15 +110,12 @@ class Crew(Protocol):
 
     def say(self, message: Message, /) -> None:
         """Tell the operator."""
-        ...
 
     def set_home(self, place: Geodetic | None, /) -> object:
         """Move home; None = to the present place."""
-        ...
 
     def return_to_launch(self) -> None:
         """End the mission and return."""
-        ...
 
 
 class _Work(Enum):
