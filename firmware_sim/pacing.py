@@ -18,8 +18,8 @@ MAX_WAKES = 16
 """So often in one tick is the wait for it broken by what arrives; more waits for the tick."""
 
 READ_AFTER_S = 300e-6
-"""What arrives so shortly before a tick is read when it has begun, and taken by it all the same:
-what many clients send takes as long to be carried out, and must not make it late [s]."""
+"""What arrives so shortly before a tick is read when it has begun, and taken by it all the same.
+What many clients send takes as long to be carried out, and must not make it late [s]."""
 
 PR_SET_TIMERSLACK = 29
 """Option of prctl(2) (linux/prctl.h): how late the kernel may wake the calling thread [ns]."""
@@ -112,7 +112,7 @@ class WallPacing:
 
         What arrives early is handled at once, stamped with its own time, and waits for the tick; in
         the last moments before it (`READ_AFTER_S`) it is left to be read then.
-        Every time handed out is read once and checked for lag first: a process that was stopped
+        Every time handed out is read once and checked for lag first. A process that was stopped
         while it waited must not stamp what has arrived with a time that is about to be given up.
         """
         clock = self.clock

@@ -16,7 +16,7 @@ class ErrorFilter(Protocol):
 
     @property
     def covariance(self) -> Vector:
-        """Of the error, (16, 16)."""
+        """Covariance of the error, (16, 16)."""
 
     def predict(self, state: Vector, gyro: Vector, accel: Vector) -> None:
         """Move nominal state and covariance by one tick's IMU sample, each (3,) FRD."""

@@ -151,14 +151,7 @@ class KernelBody:
     def __init__(
         self, arena: Arena | None, body: BodyProfile, airframe: Airframe, tick_s: float
     ) -> None:
-        """Put it at rest on the floor at the start, facing north.
-
-        Args:
-            arena: Where; None = an endless floor.
-            body: Its collision box.
-            airframe: Its mass and inertia.
-            tick_s: Length of a tick [s].
-        """
+        """Put it at rest on the floor at the start, facing north; see `bodies.new_body`."""
         self._solids, names = solids_of(arena)
         self.names: Mapping[int, str] = dict(enumerate([FLOOR, *names], start=FLOOR_ID))
         self._half = np.array([0.5 * body.width_m, 0.5 * body.width_m, 0.5 * body.height_m])

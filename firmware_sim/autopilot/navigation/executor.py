@@ -46,7 +46,7 @@ class _Look(Enum):
 
 
 class RegionOfInterest:
-    """What to look at."""
+    """Region of interest."""
 
     def __init__(self) -> None:
         self._look = _Look.NOWHERE

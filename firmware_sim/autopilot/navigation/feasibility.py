@@ -35,7 +35,7 @@ _NEVER_FIRST = frozenset(
 
 
 class Verdict(NamedTuple):
-    """What the checks found."""
+    """Result of the checks."""
 
     valid: bool
     messages: tuple[Message, ...] = ()

@@ -1,4 +1,4 @@
-"""Where Return goes, and its way along the mission: which items it flies, in which order.
+"""Destination of Return, and its way along the mission: items and their order.
 
 Source: PX4 1.16, RTL::findRtlDestination, RtlMissionFast, RtlMissionFastReverse and
 RtlDirectMissionLand, for a multicopter. They fly the places of a mission alone: no waits, no
@@ -147,7 +147,7 @@ class ReturnType(IntEnum):
 
 
 class Destination(NamedTuple):
-    """Where to return to."""
+    """Destination of Return."""
 
     place: Geodetic
     """Its altitude is the ground's."""

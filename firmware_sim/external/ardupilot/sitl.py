@@ -35,7 +35,7 @@ class ServoPacketError(ValueError):
 
 
 class ServoPacket(NamedTuple):
-    """What ArduPilot sends once per frame."""
+    """Packet of ArduPilot for each frame."""
 
     frame_rate_hz: int
     """Frames a second of simulated time that it asks for (SIM_RATE_HZ)."""

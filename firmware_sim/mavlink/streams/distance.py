@@ -1,4 +1,4 @@
-"""How far the ground is below, and how it moves, by distance and optical flow sensors.
+"""Distance and optical flow sensors: height above the ground, and its motion.
 
 Source: PX4 1.16, streams/DISTANCE_SENSOR.hpp, ALTITUDE.hpp and OPTICAL_FLOW_RAD.hpp.
 """

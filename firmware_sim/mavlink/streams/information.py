@@ -24,7 +24,7 @@ _NO_HASH = (0,) * 8
 
 
 def flight_information(state: AutopilotState) -> Values:
-    """When it was armed and took off [µs since boot], 0 while it is not."""
+    """Times of arming and take-off [µs since boot], 0 while disarmed."""
     flight_uuid = landing_time = 0
     armed, took_off = state.armed_us, state.takeoff_us
     return boot_ms(state.time_us), armed, took_off, flight_uuid, landing_time

@@ -1,4 +1,4 @@
-"""What the sensors and outputs say: IMU, pressure, GPS, battery, motors, vibration."""
+"""Sensors and outputs: IMU, pressure, GPS, battery, motors, vibration."""
 
 from __future__ import annotations
 
@@ -167,9 +167,9 @@ _CONING, _GYRO, _ACCEL, _CLIPPED, _LAST_US, _LAST_GYRO, _LAST_ACCEL, _SIZE = 0, 
 class VibrationMeter:
     """Filters every IMU sample; PX4's use of the fields differs from the MAVLink text.
 
-    vibration_x: coning, filtered |delta angle x previous delta angle| [rad²]; vibration_y:
-    filtered |gyro - previous gyro| [rad/s]; vibration_z: filtered |accel - previous accel|
-    [m/s²]; clipping_0: samples at the end of the accelerometer's range.
+    vibration_x: coning, filtered |delta angle x previous delta angle| [rad²]. vibration_y:
+    filtered |gyro - previous gyro| [rad/s]. vibration_z: filtered |accel - previous accel|
+    [m/s²]. clipping_0: samples at the end of the accelerometer's range.
     """
 
     def __init__(self) -> None:

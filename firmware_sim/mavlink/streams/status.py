@@ -1,4 +1,4 @@
-"""Who and how the vehicle is: identity, heartbeat, health, landed state, estimator, clock.
+"""Status of the vehicle: identity, heartbeat, health, landed state, estimator, clock.
 
 Source of what gimbals are told: PX4 1.16, streams/AUTOPILOT_STATE_FOR_GIMBAL_DEVICE.hpp.
 """
@@ -236,7 +236,7 @@ def mission_current(state: AutopilotState) -> Values:
 
 
 def fence_status(state: AutopilotState) -> Values:
-    """What of the geofence is breached; PX4 itself has no such stream, so it is sent on request."""
+    """Breaches of the geofence. PX4 has no such stream: it is sent on request."""
     fence = state.fence
     kind = dialect.FENCE_BREACH_NONE
     if fence.distance or fence.custom:
