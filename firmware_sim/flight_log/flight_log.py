@@ -16,9 +16,8 @@ from firmware_sim.autopilot.port import ParameterStore
 from firmware_sim.autopilot.snapshot import setpoint_of
 from firmware_sim.engine.kinematics import POSITION, QUATERNION, RATES, VELOCITY
 from firmware_sim.engine.record import Record
-from firmware_sim.flight_log.topics import SENSOR_COMBINED, TOPICS
+from firmware_sim.flight_log.topics import SENSOR_COMBINED, TOPICS, Moment, sensor_combined
 from firmware_sim.flight_log.ulog import UlogWriter, Values
-from firmware_sim.flight_log.values import Moment, sensor_combined
 from firmware_sim.interfaces import BatterySample, Truth
 
 
