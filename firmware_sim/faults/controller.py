@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -132,11 +132,9 @@ FIELDS = {
 INERTIAL = ("accel", "gyro")
 
 
-class Effect(Protocol):
-    """Effect of a fault on one sensor; has a memory of its own."""
-
-    def __call__(self, value: Any, time_us: int) -> Any:
-        """Return what is measured instead of `value` at a time; None: nothing is, in this tick."""
+Effect = Callable[[Any, int], Any]
+"""Effect of a fault on one sensor, by value and time [µs]: the measured value; None: there is none,
+in this tick. It may have a memory of its own."""
 
 
 def _off(value: Any, time_us: int) -> None:

@@ -70,17 +70,17 @@ class Logged:
     """Whether a change is logged at once; otherwise the interval alone decides."""
 
 
-SENSOR_COMBINED = Topic(
+def _topic(name: str, fields: str) -> Topic:
+    """Return a topic whose fields are "type name ...; type name ..."."""
+    groups = (group.split() for group in fields.split("; "))
+    return Topic(name, tuple(f"{kind} {name}" for kind, *names in groups for name in names))
+
+
+SENSOR_COMBINED = _topic(
     "sensor_combined",
-    (
-        "float[3] gyro_rad",
-        "uint32_t gyro_integral_dt",
-        "int32_t accelerometer_timestamp_relative",
-        "float[3] accelerometer_m_s2",
-        "uint32_t accelerometer_integral_dt",
-        "uint8_t accelerometer_clipping",
-        "uint8_t gyro_clipping",
-    ),
+    "float[3] gyro_rad; uint32_t gyro_integral_dt; int32_t accelerometer_timestamp_relative; "
+    "float[3] accelerometer_m_s2; uint32_t accelerometer_integral_dt; "
+    "uint8_t accelerometer_clipping gyro_clipping",
 )
 """Logged at every tick, from the sample itself: see `sensor_combined`."""
 
@@ -91,16 +91,11 @@ _Values = TypeVar("_Values", bound=Callable[[Moment], "Values | None"])
 
 
 def _logged(name: str, interval_ms: int | None, fields: str) -> Callable[[_Values], _Values]:
-    """Log what a function returns as a topic.
-
-    Its fields are "type name ...; type name ...". An interval of None: it is logged on change.
-    """
-    groups = (group.split() for group in fields.split("; "))
-    each = tuple(f"{kind} {name}" for kind, *names in groups for name in names)
+    """Log a function's values as a topic; with an interval of None, when they change."""
     interval_us = ON_CHANGE_US if interval_ms is None else interval_ms * US_PER_MS
 
     def register(values: _Values) -> _Values:
-        TOPICS.append(Logged(Topic(name, each), interval_us, values, interval_ms is None))
+        TOPICS.append(Logged(_topic(name, fields), interval_us, values, interval_ms is None))
         return values
 
     return register

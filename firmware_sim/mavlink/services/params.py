@@ -125,12 +125,10 @@ def _hash_message(store: ParameterStore) -> tuple[str, bytes]:
 
 @functools.lru_cache(maxsize=1)
 def _hash_of(store: ParameterStore, _revision: int) -> int:
-    """Return `parameter_hash`, which takes most of a tick, once for all clients that begin."""
-    return parameter_hash(store)
+    """Return PX4's param_hash_check(): CRC-32 without inversions over all names and values.
 
-
-def parameter_hash(store: ParameterStore) -> int:
-    """Return PX4's param_hash_check(): CRC-32 without inversions over all names and values."""
+    It takes most of a tick. All clients that begin get the same.
+    """
     parameters = filter(None, map(store.by_index, range(len(store))))
     return crc32part(b"".join(p.name.encode("ascii") + _encoded(p.value) for p in parameters))
 

@@ -104,6 +104,16 @@ class Burst:
     asker: tuple[int, int]
 
 
+class Answered(NamedTuple):
+    """Fields of an answer about its request."""
+
+    sequence: int
+    session: int
+    opcode: int
+    offset: int
+    asker: tuple[int, int]
+
+
 class Checksum:
     """The CRC-32 of a file, piece by piece: a large file takes longer than a tick."""
 
@@ -129,10 +139,7 @@ class Checksum:
 class Summing:
     """A request for a checksum that is not yet answered."""
 
-    sequence: int
-    session: int
-    offset: int
-    asker: tuple[int, int]
+    asked: Answered
     sum: Checksum
 
 
