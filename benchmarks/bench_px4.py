@@ -36,8 +36,7 @@ from firmware_sim.external.px4.program import (
     environment,
     find_px4,
 )
-from firmware_sim.external.px4.sitl import Px4Bridge
-from firmware_sim.external.transport.tcp_port import TcpPort
+from firmware_sim.external.px4.sitl import Px4Bridge, TcpPort
 from firmware_sim.mavlink.codec import Decoder, Encoder, dialect
 from firmware_sim.mavlink.endpoint import UdpEndpoint
 from firmware_sim.pacing import Pacing, Unpaced, WallPacing

@@ -45,15 +45,12 @@ class RecordedLink(Protocol):
 
     def kinematics(self) -> Kinematics:
         """Return the newest telemetry."""
-        ...
 
     def status(self) -> VehicleStatus:
         """Return who flies."""
-        ...
 
     def battery(self) -> BatteryState:
         """Return the newest state of the battery."""
-        ...
 
 
 class BlackBoxRecorder:

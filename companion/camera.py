@@ -40,11 +40,9 @@ class FrameSource(Protocol):
 
     def latest(self) -> ReceivedFrame | None:
         """Return the newest frame so far, without waiting; None before the first."""
-        ...
 
     def wait(self, newer_than_sequence: int, timeout_s: float) -> ReceivedFrame | None:
         """Wait for a frame other than a sequence (-1 = none); None after a timeout [wall s]."""
-        ...
 
 
 class ZmqFrameSource:

@@ -32,8 +32,7 @@ from companion.camera import FrameSource, SharedFrames
 from companion.cameras.by_name import OpenCamera, open_named_camera
 from companion.mavsdk_link import MavsdkLink
 from companion.mission import MissionResult, check_camera, fly_mission
-from companion.obstacles import obstacles_told
-from companion.presence import present
+from companion.presence import obstacles_told, present
 from companion.signing_proxy import signed
 from companion.watchdog import ThreadGuard
 

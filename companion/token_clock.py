@@ -31,7 +31,6 @@ class TextLink(Protocol):
 
     def exchange_texts(self, heard: Callable[[str], None]) -> Callable[[str], None]:
         """Hear the texts of the flight controller; return what sends one to it."""
-        ...
 
 
 class TokenTurns:

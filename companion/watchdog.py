@@ -157,11 +157,9 @@ class Guard(Protocol):
 
     def start(self, watchdog: Watchdog) -> None:
         """Begin to watch."""
-        ...
 
     def stop(self) -> None:
         """Stop watching; harmless when it never began."""
-        ...
 
 
 class ThreadGuard:

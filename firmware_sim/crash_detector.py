@@ -1,4 +1,4 @@
-"""Which contact ends a flight."""
+"""Contacts that end a flight."""
 
 from __future__ import annotations
 

@@ -37,32 +37,26 @@ class FlightController(Protocol):
     @property
     def rate_hz(self) -> int:
         """Sensor samples that it needs per second of simulated time."""
-        ...
 
     @property
     def flight(self) -> Flight:
         """Phase and mode."""
-        ...
 
     @property
     def internals(self) -> BuiltinAutopilot | None:
         """What the recorder reads; None for external firmware, which does not show it."""
-        ...
 
     def step(self, sample: SensorSample) -> ActuatorControls:
         """Advance to the sample's time and return the motor commands to hold until the next.
 
         Raises FirmwareLostError where it is external firmware.
         """
-        ...
 
     def use_truth(self, truth: Callable[[], Truth]) -> None:
         """Accept a source of the true state.
 
         Simulator interfaces of external firmware send it along with the sensors.
         """
-        ...
 
     def close(self) -> None:
         """Release what it holds; harmless when called again."""
-        ...

@@ -86,7 +86,7 @@ class FlowReading(NamedTuple):
     """How the ground below has moved in an image since the reading before, as OPTICAL_FLOW_RAD.
 
     A turn of the vehicle about an axis is a positive flow about it, and so is a motion forward
-    about y; a motion to the right is a negative flow about x.
+    about y. A motion to the right is a negative flow about x.
     """
 
     flow: Vector

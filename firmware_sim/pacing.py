@@ -18,8 +18,8 @@ MAX_WAKES = 16
 """So often in one tick is the wait for it broken by what arrives; more waits for the tick."""
 
 READ_AFTER_S = 300e-6
-"""What arrives so shortly before a tick is read when it has begun, and taken by it all the same:
-what many clients send takes as long to be carried out, and must not make it late [s]."""
+"""What arrives so shortly before a tick is read when it has begun, and taken by it all the same.
+What many clients send takes as long to be carried out, and must not make it late [s]."""
 
 PR_SET_TIMERSLACK = 29
 """Option of prctl(2) (linux/prctl.h): how late the kernel may wake the calling thread [ns]."""
@@ -31,11 +31,9 @@ class Arrivals(Protocol):
     @property
     def next_us(self) -> float:
         """Simulated time of the next one [µs]; inf = none."""
-        ...
 
     def arrive(self, tick_us: int) -> None:
         """Let the flight controller receive everything up to simulated `tick_us` [µs]."""
-        ...
 
 
 class Pacing(Protocol):
@@ -47,40 +45,33 @@ class Pacing(Protocol):
     @property
     def clock(self) -> Clock:
         """Simulated time; between ticks it advances only where it is paced by the wall clock."""
-        ...
 
     @property
     def epoch_ns(self) -> int | None:
         """Host monotonic time of simulated time 0 [ns]; None when it is not paced."""
-        ...
 
     @property
     def quiet_until_us(self) -> float:
         """Simulated time before which only `arrivals` can arrive [µs]; 0 = at any tick."""
-        ...
 
     @property
     def arrivals(self) -> Arrivals | None:
         """Messages that arrive before then; None = none."""
-        ...
 
     def restart(self, tick_us: int) -> None:
         """Declare that it is simulated `tick_us` now: time before that belongs to no episode."""
-        ...
 
     def wait(self, tick_us: int, sockets: Sequence[int], readable: Callable[[int], object]) -> int:
         """Wait until simulated `tick_us` is due and return the time then [µs].
 
         When a socket becomes readable before, `readable` is called with the time of that.
         """
-        ...
 
     def read_by(self, began_us: int) -> int:
         """Return a time by which what was just read had arrived, reading began at `began_us` [µs].
 
         Never before `began_us`, nor before a time that was handed out.
         """
-        ...
 
 
 class WallPacing:
@@ -121,7 +112,7 @@ class WallPacing:
 
         What arrives early is handled at once, stamped with its own time, and waits for the tick; in
         the last moments before it (`READ_AFTER_S`) it is left to be read then.
-        Every time handed out is read once and checked for lag first: a process that was stopped
+        Every time handed out is read once and checked for lag first. A process that was stopped
         while it waited must not stamp what has arrived with a time that is about to be given up.
         """
         clock = self.clock

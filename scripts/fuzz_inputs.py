@@ -51,12 +51,11 @@ from companion.camera import ZmqFrameSource
 from companion.pilot import OLDEST_FRAME_US, age_of
 from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.parameter_store import Parameters
-from firmware_sim.external.bridge import no_process
-from firmware_sim.external.parameter_file import qgroundcontrol_file
+from firmware_sim.external.launcher import no_process
+from firmware_sim.external.parameter_file import KeptParameters, qgroundcontrol_file
 from firmware_sim.external.px4.sitl import EPOCH_US, Px4Bridge
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
 from firmware_sim.interfaces import BatterySample, SensorSample
-from firmware_sim.kept_parameters import KeptParameters
 from firmware_sim.mavlink.codec import Encoder, dialect
 from firmware_sim.simulation import Simulation
 

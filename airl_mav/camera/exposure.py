@@ -37,7 +37,6 @@ class Exposure(Protocol):
         number: int = 0,
     ) -> NDArray[Any]:
         """Return the image."""
-        ...
 
 
 def exposure_by(renderer: Renderer, name: str = "") -> Exposure:

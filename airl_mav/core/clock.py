@@ -26,11 +26,9 @@ class Clock(Protocol):
 
     def time_us(self) -> int:
         """Return the present simulated time [µs]."""
-        ...
 
     def sleep_until(self, time_us: int, interrupt: threading.Event | None = None) -> None:
         """Return once `time_us()` has reached a time [µs], or early when `interrupt` is set."""
-        ...
 
 
 class SimClock:

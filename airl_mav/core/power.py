@@ -48,11 +48,9 @@ class PowerSource(Protocol):
     @property
     def name(self) -> str:
         """What is measured, in words."""
-        ...
 
     def take_j(self, elapsed_s: float) -> float | None:
         """Return the energy of the last `elapsed_s`, since the call before [J]."""
-        ...
 
 
 class EnergyCounters:

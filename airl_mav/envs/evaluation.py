@@ -55,7 +55,6 @@ class Pilots(Protocol):
 
     def begin(self, slot: int, seed: int) -> None:
         """An episode begins in a slot."""
-        ...
 
     def decide(self, seen: Observation, flying: NDArray[np.bool_]) -> NDArray[np.float64]:
         """Return the velocity commands (n, 3), or (n, 4), as `Navigation.fly` takes them.
@@ -64,7 +63,6 @@ class Pilots(Protocol):
             seen: The observations of n vehicles.
             flying: (n,) vehicles whose command will be flown.
         """
-        ...
 
 
 class LearnedPilots:

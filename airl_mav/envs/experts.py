@@ -159,11 +159,9 @@ class Chooser(Protocol):
 
     def begin(self, slots: Sequence[int]) -> None:
         """Episodes begin in slots."""
-        ...
 
     def decide(self) -> NDArray[np.int64]:
         """Return the indices (n,) of the commands chosen for the present states."""
-        ...
 
 
 class GreedyPilots:

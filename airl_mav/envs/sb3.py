@@ -27,7 +27,6 @@ class Watcher(Protocol):
 
     def begun(self) -> None:
         """All episodes begin now."""
-        ...
 
     def decided(
         self, seed: int, zone: int, action: NDArray[Any], reward: float, outcome: str | None
@@ -42,7 +41,6 @@ class Watcher(Protocol):
             outcome: How it has ended the episode, after which the next one has begun; None: the
                 episode goes on.
         """
-        ...
 
 
 class NavigationVecEnv(Stateful, VecEnv):

@@ -54,12 +54,10 @@ class Executor(Protocol):
     @property
     def workers(self) -> int:
         """Number of jobs at a time."""
-        ...
 
     @property
     def streams(self) -> bool:
         """Whether results are yielded while their job goes on, not at its end."""
-        ...
 
     def run(
         self,
@@ -81,7 +79,6 @@ class Executor(Protocol):
             UsageError: A job rejects its input.
             WorkerError: A job failed, or its worker was lost `MAX_ATTEMPTS` times.
         """
-        ...
 
 
 class InProcessExecutor:
@@ -162,8 +159,6 @@ class Flier(Protocol):
 
     def episodes_per_job(self, episodes: int, workers: int) -> int:
         """Return the episodes per job for executors that do not stream results."""
-        ...
 
     def start(self, folder: RunFolder, stop: Stop) -> FlyEpisodes:
         """Load everything once; return a function that flies episodes and polls `stop`."""
-        ...

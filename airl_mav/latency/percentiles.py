@@ -1,4 +1,4 @@
-"""Percentiles, printed only with enough samples behind them."""
+"""Percentiles, printed only with enough samples behind them; whether samples come in runs."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 MIN_SAMPLES: Final = {50.0: 1, 90.0: 64, 95.0: 130, 99.0: 662, 99.9: 6636}
 """Fewest samples for a percentile p: so many that, if the true p-quantile lay above the bound that
@@ -47,3 +47,40 @@ def summarize(samples: ArrayLike) -> Summary:
         p999=percentile(values, 99.9),
         max=float(values.max()) if values.size else None,
     )
+
+
+WINDOW = 5.0
+"""Sokal's constant: lags are summed up to this many integrated times."""
+
+
+def autocorrelation(samples: ArrayLike, lags: int) -> NDArray[np.float64]:
+    """Return the autocorrelation of samples (n,) at lags 0 to `lags` (lags + 1,), each in -1..1.
+
+    The biased estimate (every lag divided by n), whose sums stay finite. Samples without any spread
+    have none: 1 at lag 0, then 0. Raises ValueError unless n > `lags`.
+    """
+    values = np.asarray(samples, np.float64)
+    if not 0 <= lags < values.size:
+        raise ValueError(f"lags={lags}: must be below the number of samples, {values.size}")
+    centred = values - values.mean()
+    power = float(centred @ centred)
+    result = np.zeros(lags + 1)
+    result[0] = 1.0
+    if power > 0.0:
+        for lag in range(1, lags + 1):
+            result[lag] = float(centred[lag:] @ centred[:-lag]) / power
+    return result
+
+
+def integrated_time(samples: ArrayLike) -> float:
+    """Return the integrated autocorrelation time [decisions], 1 for independent samples.
+
+    1 + 2 (rho_1 + ... + rho_M), with Sokal's window: M is the least that is 5 of these times or
+    more (Sokal 1997, Monte Carlo methods in statistical mechanics, section 3). n >= 2 samples carry
+    as much about the mean as n / time independent ones.
+    """
+    values = np.asarray(samples, np.float64)
+    most = values.size // 2
+    times = 1.0 + 2.0 * np.cumsum(autocorrelation(values, most)[1:])
+    wide = np.flatnonzero(np.arange(1, most + 1) >= WINDOW * times)
+    return float(times[wide[0]] if wide.size else times[-1])

@@ -20,7 +20,6 @@ class LatencySampler(Protocol):
 
     def sample_us(self) -> int:
         """Return the next latency [µs], >= 0."""
-        ...
 
 
 class FixedSampler:

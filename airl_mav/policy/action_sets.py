@@ -90,11 +90,9 @@ class ActionSet(Protocol):
     @property
     def discrete(self) -> int | None:
         """Number of discrete actions; None for a continuous set, of two numbers -1..1."""
-        ...
 
     def commands(self, actions: NDArray[Any], max_speed_m_s: float) -> NDArray[np.float64]:
         """Return the commands (n, 3) of n actions, as the function `commands` does."""
-        ...
 
 
 def discrete_actions(spec: ActionSpec) -> int | None:

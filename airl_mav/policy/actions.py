@@ -128,7 +128,6 @@ class Policy(Protocol):
 
     def act(self, observation: Observation) -> AnyAction:
         """Return the action for an observation."""
-        ...
 
 
 def command_kind(policy: object) -> CommandKind:
@@ -147,11 +146,9 @@ class CameraBound(Protocol):
     @property
     def name(self) -> str:
         """Name of the policy."""
-        ...
 
     def refuses(self, camera: Intrinsics) -> str | None:
         """Return why a camera cannot serve the policy, or None when it can."""
-        ...
 
 
 @runtime_checkable
@@ -160,7 +157,6 @@ class RigBound(CameraBound, Protocol):
 
     def refuses_further(self, cameras: Mapping[str, Intrinsics]) -> str | None:
         """Return why further cameras, by name, cannot serve the policy, or None when they can."""
-        ...
 
 
 def flyable(action: AnyAction, kind: CommandKind, speed_m_s: float) -> AnyAction:

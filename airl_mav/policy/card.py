@@ -59,22 +59,18 @@ class Measured(Protocol):
     @property
     def value(self) -> float | None:
         """None: nothing to work it out from."""
-        ...
 
     @property
     def low(self) -> float | None:
         """Lower end of the interval."""
-        ...
 
     @property
     def high(self) -> float | None:
         """Upper end of the interval."""
-        ...
 
     @property
     def n(self) -> int:
         """Flights behind it."""
-        ...
 
 
 class MeasuredQuality(Protocol):
@@ -83,22 +79,18 @@ class MeasuredQuality(Protocol):
     @property
     def success_rate(self) -> Measured:
         """Fraction, 0 to 1."""
-        ...
 
     @property
     def flight_time_s(self) -> Measured:
         """This and the following: means over the successful flights."""
-        ...
 
     @property
     def distance_m(self) -> Measured:
         """Flown [m]."""
-        ...
 
     @property
     def energy_j(self) -> Measured:
         """Of the vehicle, without its computer [J]."""
-        ...
 
 
 class MeasuredResult(ProfileModel):

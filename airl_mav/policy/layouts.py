@@ -274,11 +274,9 @@ class Layout(Protocol):
 
         The same of the keys of further cameras (`spec.further_keys`).
         """
-        ...
 
     def encode(self, spec: ObservationSpec, seen: Observation) -> Mapping[str, NDArray[Any]]:
         """Return those arrays for n vehicles, as `encode_layout` does: of each from its own row."""
-        ...
 
 
 def own_boxes(spec: ObservationSpec) -> dict[str, Box]:

@@ -48,7 +48,6 @@ class Runtime(Protocol):
 
     def infer(self, encoded: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
         """Return the outputs (n, k) for the arrays of a layout, each with n rows."""
-        ...
 
 
 @runtime_checkable
@@ -59,7 +58,6 @@ class RecurrentRuntime(Runtime, Protocol):
         self, encoded: Mapping[str, NDArray[Any]], memory: Memory
     ) -> tuple[NDArray[np.float32], Memory]:
         """Return the outputs (n, k) of a network with a memory, and what it will remember."""
-        ...
 
 
 def blank_memory(shapes: Shapes, n: int) -> Memory:

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S
-from airl_mav.latency.autocorrelation import integrated_time
+from airl_mav.latency.percentiles import integrated_time
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.refitting.flown import Flown
 from airl_mav.refitting.quantity import Array, FittedQuantity

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.stats import bootstrap
 
 from airl_mav.core.constants import US_PER_MS
-from airl_mav.latency.autocorrelation import integrated_time
+from airl_mav.latency.percentiles import integrated_time
 from airl_mav.latency.stamps import NO_STAMP
 from airl_mav.refitting.quantity import LEVEL, RESAMPLES, FittedQuantity
 from airl_mav.vehicle_log.alignment import Alignment

@@ -61,11 +61,9 @@ class Restorable(Protocol):
 
     def get_state(self) -> Mapping[str, NDArray[Any]]:
         """Return its whole state by name."""
-        ...
 
     def set_state(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Restore what `get_state` returned."""
-        ...
 
 
 def collect(model: BaseAlgorithm) -> tuple[dict[str, Any], Arrays, dict[str, Any]]:

@@ -30,16 +30,13 @@ class OpenCamera(FrameSource, Protocol):
     @property
     def failure(self) -> str | None:
         """Return why no more frames come; None: they do, or it is not known."""
-        ...
 
     @property
     def dropped(self) -> int:
         """Return how many images of the camera never came here; 0 where that is not known."""
-        ...
 
     def close(self) -> None:
         """Let go of the camera."""
-        ...
 
 
 def open_named_camera(

@@ -73,15 +73,12 @@ class DepthCamera(Protocol):
     @property
     def lens(self) -> Lens:
         """Return the lens; it stays the same."""
-        ...
 
     def read(self, timeout_s: float) -> DepthImage | None:
         """Wait for the next image; None after a timeout [s]. Exceptions are camera failures."""
-        ...
 
     def close(self) -> None:
         """Let go of the camera."""
-        ...
 
 
 def missing_between(last: int | None, number: int | None) -> int:

@@ -1,4 +1,4 @@
-"""How the estimator begins: sensors averaged at rest, level by gravity, north by the compass."""
+"""Start of the estimator: sensors averaged at rest, level by gravity, north by the compass."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ _NO_COMPASS = 5
 
 
 class Aligned(NamedTuple):
-    """What is known at the end."""
+    """Result of the alignment."""
 
     quaternion: Vector  # (4,) body -> NED
     altitude_baro_m: float

@@ -1,4 +1,4 @@
-"""What the autopilot knows and reports: plain data for MAVLink, the recorder and tests.
+"""State of the autopilot: plain data for MAVLink, the recorder and tests.
 
 Whatever is created for every snapshot is a named tuple, which is faster than a dataclass.
 """
@@ -183,7 +183,7 @@ class Estimate(NamedTuple):
 
 
 class Clearance(NamedTuple):
-    """How far the ground is below the vehicle, as estimated (vehicle_local_position)."""
+    """Estimated height above the ground (vehicle_local_position)."""
 
     dist_bottom_m: float
     """Not negative."""
@@ -199,7 +199,7 @@ class Clearance(NamedTuple):
 
 
 class CommanderStatus(NamedTuple):
-    """What the commander reports."""
+    """State of the commander."""
 
     arming: Arming
     mode: Mode
@@ -210,7 +210,7 @@ class CommanderStatus(NamedTuple):
 
 
 class MissionProgress(NamedTuple):
-    """How far the mission has come."""
+    """Progress of the mission."""
 
     current: int = 0
     """Index of the item that is flown, or will be when the mission goes on."""
@@ -226,7 +226,7 @@ NO_MISSION = MissionProgress()
 
 
 class FenceStatus(NamedTuple):
-    """Which limits of the geofence are violated, and how often that began."""
+    """Violated limits of the geofence, and the number of breaches."""
 
     distance: bool = False
     """Farther from home than GF_MAX_HOR_DIST."""
@@ -241,7 +241,7 @@ class FenceStatus(NamedTuple):
 
     @property
     def breached(self) -> tuple[bool, bool, bool]:
-        """What is violated now: distance, altitude, custom."""
+        """Present breaches: distance, altitude, custom."""
         return self.distance, self.altitude, self.custom
 
 
@@ -286,184 +286,147 @@ class AutopilotState(Protocol):
     @property
     def time_us(self) -> int:
         """Simulated time of the tick [µs]."""
-        ...
 
     @property
     def settled(self) -> object:
         """The same object as long as nothing has changed that a tick's log lacks; None = it may."""
-        ...
 
     @property
     def estimate(self) -> Estimate:
         """The estimator's output."""
-        ...
 
     @property
     def status(self) -> CommanderStatus:
-        """What the commander reports."""
-        ...
+        """State of the commander."""
 
     @property
     def setpoint(self) -> Setpoint:
-        """What the controller tracks (in every mode)."""
-        ...
+        """Setpoint that the controller tracks, in every mode."""
 
     @property
     def attitude_setpoint(self) -> Vector:
         """(4,) body -> NED."""
-        ...
 
     @property
     def rate_setpoint(self) -> Vector:
         """(3,) FRD [rad/s]."""
-        ...
 
     @property
     def thrust_setpoint(self) -> float:
         """Collective, 0..1."""
-        ...
 
     @property
     def motors(self) -> tuple[float, float, float, float]:
         """Commands of the motors, 0..1."""
-        ...
 
     @property
     def accel(self) -> Vector:
         """(3,) newest raw sample, FRD [m/s²]."""
-        ...
 
     @property
     def gyro(self) -> Vector:
         """(3,) newest raw sample, FRD [rad/s]."""
-        ...
 
     @property
     def mag(self) -> Vector:
         """(3,) newest raw sample, FRD [gauss]."""
-        ...
 
     @property
     def pressure_hpa(self) -> float:
         """Newest static pressure [hPa]."""
-        ...
 
     @property
     def temperature_c(self) -> float:
-        """Of the air [°C]."""
-        ...
+        """Air temperature [°C]."""
 
     @property
     def battery(self) -> BatterySample:
-        """What the power module reports."""
-        ...
+        """Report of the power module."""
 
     @property
     def gps(self) -> GpsFix | None:
         """Newest fix; None before the first."""
-        ...
 
     @property
     def home(self) -> Geodetic | None:
         """Set when the estimator's origin is set and at arming; None before."""
-        ...
 
     @property
     def origin(self) -> Geodetic | None:
         """The point of the globe where local NED is zero; None before the first fix."""
-        ...
 
     @property
     def load(self) -> float:
         """Share of the tick spent computing, 0..1."""
-        ...
 
     @property
     def armed_us(self) -> int:
-        """When it was armed [µs], 0 while it is not."""
-        ...
+        """Time of arming [µs], 0 while disarmed."""
 
     @property
     def takeoff_us(self) -> int:
-        """When it left the ground [µs], 0 before."""
-        ...
+        """Time of take-off [µs], 0 before."""
 
     @property
     def mission(self) -> MissionProgress:
-        """How far the mission has come."""
-        ...
+        """Progress of the mission."""
 
     @property
     def fence(self) -> FenceStatus:
-        """Which limits of the geofence are violated."""
-        ...
+        """Violated limits of the geofence."""
 
     @property
     def orbit(self) -> OrbitStatus | None:
         """The circle that is flown, in Orbit mode."""
-        ...
 
     @property
     def health(self) -> Health:
         """What can be believed and used."""
-        ...
 
     @property
     def hover_thrust(self) -> float:
         """Collective that hovers, 0..1."""
-        ...
 
     @property
     def destination(self) -> tuple[float, float, float] | None:
-        """Where an automatic mode is going, local NED [m]; None in other modes."""
-        ...
+        """Destination of an automatic mode, local NED [m]; None in other modes."""
 
     @property
     def home_yaw(self) -> float:
         """Heading at home [rad]."""
-        ...
 
     @property
     def sticks(self) -> Sticks | None:
         """A pilot's; None = none are heard."""
-        ...
 
     @property
     def esc_outputs(self) -> tuple[float, float, float, float] | None:
         """What the speed controllers report that their motors do; None: what they are told."""
-        ...
 
     @property
     def odometry(self) -> Odometry | None:
         """The newest pose that something else has estimated; None before any."""
-        ...
 
     @property
     def odometry_us(self) -> int:
-        """When it was told [µs]."""
-        ...
+        """Time of its arrival [µs]."""
 
     @property
     def distance(self) -> DistanceReading | None:
         """The newest of a distance sensor; None before any."""
-        ...
 
     @property
     def distance_us(self) -> int:
-        """When it came [µs]."""
-        ...
+        """Time of its arrival [µs]."""
 
     @property
     def flow(self) -> FlowReading | None:
         """The newest of an optical flow sensor; None before any."""
-        ...
 
     @property
     def flow_us(self) -> int:
-        """When it came [µs]."""
-        ...
+        """Time of its arrival [µs]."""
 
     @property
     def clearance(self) -> Clearance | None:
-        """How far the ground is below; None before the first range."""
-        ...
+        """Height above the ground; None before the first range."""

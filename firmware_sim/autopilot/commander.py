@@ -93,7 +93,7 @@ class Flight:
 
 
 class Choice(Enum):
-    """How a row picks the next mode."""
+    """Choice of the next mode by a row."""
 
     KEEP = auto()
     """No change."""

@@ -34,7 +34,7 @@ HEADING_RUN = 25
 """Headings in a row: 0.5 s at 50 Hz."""
 
 LATE_S = 0.5
-"""A receiver may be so much later than stated: a velocity that differs by no more than what the
+"""A receiver may be so much later than stated. A velocity that differs by no more than what the
 vehicle has changed its own in that time says nothing of the inertial sensors [s]."""
 
 LOOK_BACK = 6

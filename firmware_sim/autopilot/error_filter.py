@@ -16,16 +16,13 @@ class ErrorFilter(Protocol):
 
     @property
     def covariance(self) -> Vector:
-        """Of the error, (16, 16)."""
-        ...
+        """Covariance of the error, (16, 16)."""
 
     def predict(self, state: Vector, gyro: Vector, accel: Vector) -> None:
         """Move nominal state and covariance by one tick's IMU sample, each (3,) FRD."""
-        ...
 
     def restart(self, covariance: Vector) -> None:
         """Go on from another covariance (16, 16): what was known is so no longer."""
-        ...
 
     def fuse(self, state: Vector, innovation: Vector, h: Vector, variance: Vector) -> float:
         """Correct the nominal state by one measurement, unless it fails the gate.
@@ -39,7 +36,6 @@ class ErrorFilter(Protocol):
         Returns:
             The test ratio: 1 = at the gate; above it, or NaN, nothing was corrected.
         """
-        ...
 
 
 NewFilter = Callable[[Vector, Vector], ErrorFilter]

@@ -124,7 +124,7 @@ def inject(row: Vector, error: Vector) -> None:
 def true_heading(field: Vector, q: Quat, declination: float) -> float:
     """Return the heading [rad] that a field measurement (3,) FRD shows, less that of q.
 
-    The field is turned into the world by q: with a q of heading 0 it is the true heading itself,
+    The field is turned into the world by q. With a q of heading 0 it is the true heading itself,
     with the vehicle's attitude it is the error of its heading.
     """
     north, east, _ = rotate(q, (field[0], field[1], field[2]))

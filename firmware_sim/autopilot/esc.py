@@ -1,4 +1,4 @@
-"""What speed controllers report of their motors.
+"""Reports of the speed controllers about their motors.
 
 Source: PX4 1.16, SimulatorMavlink::send_esc_telemetry: it has no model of them, and neither has
 this. A motor that does not turn draws nothing.

@@ -24,7 +24,7 @@ class FilterpyFilter:
 
     @property
     def covariance(self) -> Vector:
-        """Of the error, (16, 16)."""
+        """Covariance of the error, (16, 16)."""
         p: Vector = self._ekf.P
         return p
 

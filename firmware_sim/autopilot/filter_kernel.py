@@ -1,8 +1,8 @@
 """The filter of the estimator's error as compiled code: the default.
 
 The same filter as `filter_filterpy` up to rounding, with what is known of its matrices: most rows
-of the transition matrix are the identity's, and the noises of a measurement's components are
-independent, so that fusing them one after the other equals fusing them together (Bar-Shalom, Li,
+of the transition matrix are the identity's. The noises of a measurement's components are
+independent: fusing them one after the other equals fusing them together (Bar-Shalom, Li,
 Kirubarajan, Estimation with Applications to Tracking and Navigation, ch. 7.2.2). The covariance is
 exactly symmetric at any time.
 """

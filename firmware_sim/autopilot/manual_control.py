@@ -29,7 +29,7 @@ class Sticks(NamedTuple):
 
 
 class Source(Enum):
-    """Where sticks come from."""
+    """Source of sticks."""
 
     RADIO = auto()
     JOYSTICK = auto()

@@ -13,62 +13,42 @@ from firmware_sim.autopilot.events.enumerations import NavigationMode
 
 MAIN_POSCTL, MAIN_AUTO, MAIN_ACRO, MAIN_OFFBOARD, MAIN_TERMINATION = 3, 4, 5, 6, 10
 
-MAIN_SUB: Mapping[Mode, tuple[int, int]] = {
-    Mode.HOLD: (MAIN_AUTO, 3),
-    Mode.TAKEOFF: (MAIN_AUTO, 2),
-    Mode.LAND: (MAIN_AUTO, 6),
-    Mode.RETURN: (MAIN_AUTO, 5),
-    Mode.OFFBOARD: (MAIN_OFFBOARD, 0),
-    Mode.POSITION: (MAIN_POSCTL, 0),
-    Mode.MISSION: (MAIN_AUTO, 4),
-    Mode.ORBIT: (MAIN_POSCTL, 1),
-    Mode.FOLLOW: (MAIN_AUTO, 8),
-    Mode.MANUAL: (1, 0),
-    Mode.ALTITUDE: (2, 0),
-    Mode.ACRO: (MAIN_ACRO, 0),
-    Mode.STABILIZED: (7, 0),
-    Mode.DESCEND: (MAIN_AUTO, 6),  # PX4 reports it as Land
-    Mode.TERMINATION: (MAIN_TERMINATION, 0),
-    Mode.PRECISION_LAND: (MAIN_AUTO, 9),
+_N = NavigationMode
+
+_NUMBERS: Mapping[Mode, tuple[int, int, int, NavigationMode]] = {
+    Mode.HOLD: (MAIN_AUTO, 3, 4, _N.AUTO_LOITER),
+    Mode.TAKEOFF: (MAIN_AUTO, 2, 17, _N.AUTO_TAKEOFF),
+    Mode.LAND: (MAIN_AUTO, 6, 18, _N.AUTO_LAND),
+    Mode.RETURN: (MAIN_AUTO, 5, 5, _N.AUTO_RTL),
+    Mode.OFFBOARD: (MAIN_OFFBOARD, 0, 14, _N.OFFBOARD),
+    Mode.POSITION: (MAIN_POSCTL, 0, 2, _N.POSCTL),
+    Mode.MISSION: (MAIN_AUTO, 4, 3, _N.AUTO_MISSION),
+    Mode.ORBIT: (MAIN_POSCTL, 1, 21, _N.ORBIT),
+    Mode.FOLLOW: (MAIN_AUTO, 8, 19, _N.AUTO_FOLLOW_TARGET),
+    Mode.MANUAL: (1, 0, 0, _N.MANUAL),
+    Mode.ALTITUDE: (2, 0, 1, _N.ALTCTL),
+    Mode.ACRO: (MAIN_ACRO, 0, 10, _N.ACRO),
+    Mode.STABILIZED: (7, 0, 15, _N.STAB),
+    Mode.DESCEND: (MAIN_AUTO, 6, 12, _N.UNKNOWN),  # PX4 reports it as Land
+    Mode.TERMINATION: (MAIN_TERMINATION, 0, 13, _N.UNKNOWN),
+    Mode.PRECISION_LAND: (MAIN_AUTO, 9, 20, _N.AUTO_PRECLAND),
 }
+"""Main mode, sub mode, navigation state (VehicleStatus.nav_state), number in messages."""
+
+MAIN_SUB = {mode: (main, sub) for mode, (main, sub, _, _) in _NUMBERS.items()}
 """Main and sub mode."""
 
-STATE_BITS: Mapping[Mode, int] = {
-    Mode.MANUAL: 1 << 0,
-    Mode.ALTITUDE: 1 << 1,
-    Mode.POSITION: 1 << 2 | 1 << 6,  # also in its slow variant
-    Mode.MISSION: 1 << 3,
-    Mode.HOLD: 1 << 4,
-    Mode.RETURN: 1 << 5,
-    Mode.ACRO: 1 << 10,
-    Mode.DESCEND: 1 << 12,
-    Mode.TERMINATION: 1 << 13,
-    Mode.OFFBOARD: 1 << 14,
-    Mode.STABILIZED: 1 << 15,
-    Mode.TAKEOFF: 1 << 17 | 1 << 22,  # also a VTOL's, which no multicopter flies
-    Mode.LAND: 1 << 18,
-    Mode.FOLLOW: 1 << 19,
-    Mode.PRECISION_LAND: 1 << 20,
-    Mode.ORBIT: 1 << 21,
+NAVIGATION_STATES = {mode: state for mode, (_, _, state, _) in _NUMBERS.items()}
+
+_MORE_STATES = {
+    Mode.POSITION: 1 << 6,  # its slow variant
+    Mode.TAKEOFF: 1 << 22,  # a VTOL's, which no multicopter flies
+}
+
+STATE_BITS = {
+    mode: 1 << state | _MORE_STATES.get(mode, 0) for mode, state in NAVIGATION_STATES.items()
 }
 """A mode's navigation states, each a bit of what a check says of modes."""
-
-_NAMED: Mapping[Mode, NavigationMode] = {
-    Mode.MANUAL: NavigationMode.MANUAL,
-    Mode.ALTITUDE: NavigationMode.ALTCTL,
-    Mode.POSITION: NavigationMode.POSCTL,
-    Mode.MISSION: NavigationMode.AUTO_MISSION,
-    Mode.HOLD: NavigationMode.AUTO_LOITER,
-    Mode.RETURN: NavigationMode.AUTO_RTL,
-    Mode.ACRO: NavigationMode.ACRO,
-    Mode.OFFBOARD: NavigationMode.OFFBOARD,
-    Mode.STABILIZED: NavigationMode.STAB,
-    Mode.TAKEOFF: NavigationMode.AUTO_TAKEOFF,
-    Mode.LAND: NavigationMode.AUTO_LAND,
-    Mode.FOLLOW: NavigationMode.AUTO_FOLLOW_TARGET,
-    Mode.PRECISION_LAND: NavigationMode.AUTO_PRECLAND,
-    Mode.ORBIT: NavigationMode.ORBIT,
-}
 
 
 def custom_mode(mode: Mode) -> int:
@@ -79,4 +59,4 @@ def custom_mode(mode: Mode) -> int:
 
 def named(mode: Mode) -> NavigationMode:
     """Return the number by which a message names a mode."""
-    return _NAMED.get(mode, NavigationMode.UNKNOWN)
+    return _NUMBERS[mode][3]

@@ -19,15 +19,13 @@ _INT32_LOW, _INT32_HIGH = -(2**31), 2**31 - 1
 
 
 class Keeper(Protocol):
-    """Where parameters are kept that outlive the flight controller."""
+    """Memory of parameters that outlives the flight controller."""
 
     def read(self) -> Mapping[str, int | float]:
         """Return what is kept. Raises UsageError when it cannot be read."""
-        ...
 
     def write(self, values: Mapping[str, int | float]) -> None:
         """Keep these instead. Raises OSError when they cannot be written."""
-        ...
 
 
 class Parameters:

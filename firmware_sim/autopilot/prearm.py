@@ -14,7 +14,7 @@ from firmware_sim.autopilot.autopilot_state import Severity
 from firmware_sim.autopilot.events import check_events as events
 from firmware_sim.autopilot.events.check_events import CheckEvent
 from firmware_sim.autopilot.events.definition import Level
-from firmware_sim.autopilot.failsafes.conditions import NEEDS, BatteryWarning, Need
+from firmware_sim.autopilot.failsafes.conditions import NEEDS, BatteryWarning, Conditions, Need
 from firmware_sim.autopilot.readiness import SUPPLY_CHECK_OFF, Part, Readiness
 
 
@@ -23,10 +23,11 @@ class Check(NamedTuple):
 
     part: Part
     fails: Callable[[Readiness], bool]
-    text: str
-    """Text for the operator."""
     event: CheckEvent
     """Its event for ground stations."""
+    told: str = ""
+    """Text for the operator; "" = `prefix` and the words of the event."""
+    prefix: str = "Preflight Fail: "
     said: bool = True
     """Whether PX4 says it by itself when it begins to fail; else only when arming is refused."""
     blocks: Callable[[Readiness], bool] | None = None
@@ -40,30 +41,59 @@ class Check(NamedTuple):
     of_present_mode: bool = False
     """Whether it is told only while the vehicle is in a mode in which it fails."""
 
+    @property
+    def text(self) -> str:
+        """Text for the operator."""
+        return self.told or self.prefix + self.event.definition.message
+
 
 def never(_readiness: Readiness) -> bool:
     """Return that a check keeps no vehicle from arming."""
     return False
 
 
-def _lacks(need: Need) -> Callable[[Readiness], bool]:
-    return lambda r: bool(NEEDS[r.mode] & need)
+def _needs(r: Readiness, need: Need) -> bool:
+    return bool(NEEDS[r.mode] & need)
+
+
+def _global_required(r: Readiness) -> bool:
+    return r.settings.com_arm_wo_gps == _GLOBAL_REQUIRED and not r.armed and r.converged
+
+
+def _estimate(
+    name: str, event: CheckEvent, need: Need, fails: Callable[[Conditions], bool]
+) -> Check:
+    return Check(
+        Part.ESTIMATOR,
+        lambda r: fails(r.conditions),
+        event,
+        f"Preflight Fail: No valid {name} estimate",
+        said=False,
+        blocks=lambda r: _needs(r, need),
+    )
+
+
+def _fence(kind: str, event: CheckEvent) -> Check:
+    def breached(r: Readiness) -> bool:
+        return getattr(r.conditions.geofence, kind) and r.settings.gf_action != 0
+
+    return Check(Part.SYSTEM, breached, event, prefix="")
 
 
 def _sensor(part: Part, name: str, event: CheckEvent, fails: Callable[[Readiness], bool]) -> Check:
-    return Check(part, fails, f"Preflight Fail: No valid data from {name}", event)
+    return Check(part, fails, event, f"Preflight Fail: No valid data from {name}")
 
 
 def _field_fails(r: Readiness, as_asked: int) -> bool:
     return r.field_disturbed and not r.armed and r.settings.com_arm_mag_str == as_asked
 
 
-def _battery(level: BatteryWarning, text: str, event: CheckEvent) -> Check:
+def _battery(level: BatteryWarning, event: CheckEvent) -> Check:
     return Check(
         Part.BATTERY,
         lambda r: _supply_checked(r) and _battery_level(r) is level,
-        text,
         event,
+        prefix="",
         blocks=_battery_blocks,
         severity=Severity.EMERGENCY,
         level=_battery_urgency,
@@ -132,7 +162,6 @@ CHECKS: tuple[Check, ...] = (
     Check(
         Part.GPS,
         lambda r: bool(r.settings.sys_has_gps) and not r.gps and r.settings.com_arm_wo_gps == 0,
-        "Preflight Fail: GPS fix too low",
         events.GPS_FIX_TOO_LOW,
     ),
     Check(
@@ -143,8 +172,8 @@ CHECKS: tuple[Check, ...] = (
             and not r.armed
             and r.settings.com_arm_wo_gps == 1
         ),
-        "Preflight: GPS fix too low",
         events.GPS_FIX_TOO_LOW,
+        prefix="Preflight: ",
         blocks=never,
         severity=Severity.WARNING,
         level=lambda _: Level.WARNING,
@@ -153,57 +182,49 @@ CHECKS: tuple[Check, ...] = (
     Check(
         Part.DISTANCE_SENSOR,
         lambda r: r.settings.sys_has_num_dist > 0 and r.distance is None,
-        "Preflight Fail: Distance Sensor 0 missing",
         events.DISTANCE_SENSOR_MISSING,
+        told="Preflight Fail: Distance Sensor 0 missing",
     ),
     Check(
         Part.DISTANCE_SENSOR,
         lambda r: r.settings.sys_has_num_dist > 0 and r.distance is False,
-        "Preflight Fail: no valid data from distance sensor 0",
         events.DISTANCE_SENSOR_INVALID,
+        told="Preflight Fail: no valid data from distance sensor 0",
     ),
-    _battery(BatteryWarning.LOW, "Low battery", events.BATTERY_LOW),
-    _battery(BatteryWarning.CRITICAL, "Critical battery", events.BATTERY_CRITICAL),
-    _battery(BatteryWarning.EMERGENCY, "Emergency battery level", events.BATTERY_EMERGENCY),
+    _battery(BatteryWarning.LOW, events.BATTERY_LOW),
+    _battery(BatteryWarning.CRITICAL, events.BATTERY_CRITICAL),
+    _battery(BatteryWarning.EMERGENCY, events.BATTERY_EMERGENCY),
     Check(
         Part.BATTERY,
         lambda r: _supply_checked(r) and r.conditions.battery_unhealthy,
-        "Preflight Fail: Battery unhealthy",
         events.BATTERY_UNHEALTHY,
     ),
     Check(
         Part.BATTERY,
         lambda r: _supply_checked(r) and r.conditions.battery_low_remaining_time,
-        "Remaining flight time low",
         events.BATTERY_TIME_LOW,
+        prefix="",
         said=False,
     ),
     Check(
         Part.ESTIMATOR,
         lambda r: not r.converged and not r.armed,
-        "Preflight Fail: ekf2 missing data",
         events.ESTIMATOR_MISSING,
+        told="Preflight Fail: ekf2 missing data",
         said=False,
     ),
     Check(
         Part.ESTIMATOR,
         lambda r: not r.compass_agrees and not r.armed,
-        "Preflight Fail: heading estimate not stable",
         events.HEADING_UNSTABLE,
+        told="Preflight Fail: heading estimate not stable",
     ),
-    Check(
-        Part.ESTIMATOR,
-        lambda r: (
-            r.field_disturbed and not r.armed and r.settings.com_arm_mag_str == _FIELD_REQUIRED
-        ),
-        "Preflight Fail: Strong magnetic interference",
-        events.MAG_INTERFERENCE,
-    ),
+    Check(Part.ESTIMATOR, lambda r: _field_fails(r, _FIELD_REQUIRED), events.MAG_INTERFERENCE),
     Check(
         Part.ESTIMATOR,
         lambda r: _field_fails(r, _FIELD_WARNED),
-        "Preflight: Strong magnetic interference",
         events.MAG_INTERFERENCE,
+        prefix="Preflight: ",
         # Before the estimator has a heading, that field is what it waits for the end of.
         blocks=lambda r: not r.converged,
         severity=Severity.WARNING,
@@ -211,39 +232,19 @@ CHECKS: tuple[Check, ...] = (
     Check(
         Part.SYSTEM,
         lambda r: r.rolled,
-        "Preflight Fail: Attitude failure (roll)",
         events.ROLLED,
+        told="Preflight Fail: Attitude failure (roll)",
     ),
     Check(
         Part.SYSTEM,
         lambda r: r.pitched and not r.rolled,
-        "Preflight Fail: Attitude failure (pitch)",
         events.PITCHED,
+        told="Preflight Fail: Attitude failure (pitch)",
     ),
-    Check(
-        Part.SYSTEM,
-        lambda r: r.conditions.fd_motor_failure,
-        "Preflight Fail: Motor failure detected",
-        events.MOTOR_FAILED,
-    ),
-    Check(
-        Part.SYSTEM,
-        lambda r: r.conditions.geofence.distance and r.settings.gf_action != 0,
-        "Geofence violation: exceeding maximum distance to Home",
-        events.FENCE_DISTANCE,
-    ),
-    Check(
-        Part.SYSTEM,
-        lambda r: r.conditions.geofence.altitude and r.settings.gf_action != 0,
-        "Geofence violation: exceeding maximum altitude above Home",
-        events.FENCE_ALTITUDE,
-    ),
-    Check(
-        Part.SYSTEM,
-        lambda r: r.conditions.geofence.custom and r.settings.gf_action != 0,
-        "Geofence violation: approaching or outside geofence",
-        events.FENCE_CUSTOM,
-    ),
+    Check(Part.SYSTEM, lambda r: r.conditions.fd_motor_failure, events.MOTOR_FAILED),
+    _fence("distance", events.FENCE_DISTANCE),
+    _fence("altitude", events.FENCE_ALTITUDE),
+    _fence("custom", events.FENCE_CUSTOM),
     Check(
         Part.SYSTEM,
         lambda r: (
@@ -251,138 +252,87 @@ CHECKS: tuple[Check, ...] = (
             and r.conditions.home_position_invalid
             and r.converged
         ),
-        "Preflight Fail: Geofence RTL requires valid home",
         events.FENCE_NO_HOME,
     ),
-    Check(
-        Part.SYSTEM,
-        lambda r: r.conditions.mission_failure,
-        "Mission cannot be completed",
-        events.MISSION_FAILURE,
-    ),
+    Check(Part.SYSTEM, lambda r: r.conditions.mission_failure, events.MISSION_FAILURE, prefix=""),
     Check(
         Part.SYSTEM,
         lambda r: r.conditions.flight_time_limit_exceeded,
-        "Maximum flight time reached",
         events.FLIGHT_TIME,
+        prefix="",
     ),
     Check(
         Part.LINK,
         lambda r: r.conditions.gcs_connection_lost and r.settings.nav_dll_act > 0,
-        "Preflight Fail: No connection to the ground control station",
         events.NO_GCS,
         severity=Severity.WARNING,
     ),
     Check(
         Part.LINK,
         lambda r: r.conditions.gcs_connection_lost and r.settings.nav_dll_act <= 0,
-        "No connection to the ground control station",
         events.NO_GCS,
+        prefix="",
         said=False,
         blocks=never,
         level=lambda _: Level.INFO,
     ),
+    Check(Part.SYSTEM, lambda r: r.terminated, events.TERMINATED),
     Check(
         Part.SYSTEM,
-        lambda r: r.terminated,
-        "Preflight Fail: Flight termination active",
-        events.TERMINATED,
-    ),
-    Check(
-        Part.SYSTEM,
-        lambda r: (
-            r.settings.com_arm_wo_gps == _GLOBAL_REQUIRED
-            and not r.armed
-            and r.converged
-            and r.conditions.global_position_invalid
-        ),
-        "Preflight Fail: Global position estimate required",
+        lambda r: _global_required(r) and r.conditions.global_position_invalid,
         events.NO_GLOBAL_POSITION,
     ),
     Check(
         Part.SYSTEM,
-        lambda r: (
-            r.settings.com_arm_wo_gps == _GLOBAL_REQUIRED
-            and not r.armed
-            and r.converged
-            and r.conditions.home_position_invalid
-        ),
-        "Preflight Fail: Home position required",
+        lambda r: _global_required(r) and r.conditions.home_position_invalid,
         events.NO_HOME,
     ),
     # What a mode needs. PX4 tells it by events alone, and so do we until arming is refused.
     Check(
         Part.SYSTEM,
-        lambda r: bool(NEEDS[r.mode] & Need.NOT_ARMING) and not r.terminated and not r.armed,
-        "Preflight Fail: Mode not suitable for arming",
+        lambda r: _needs(r, Need.NOT_ARMING) and not r.terminated and not r.armed,
         events.MODE_CANNOT_ARM,
         said=False,
         of_present_mode=True,
     ),
-    Check(
-        Part.ESTIMATOR,
-        lambda r: r.conditions.attitude_invalid,
-        "Preflight Fail: No valid attitude estimate",
-        events.MODE_ATTITUDE,
-        said=False,
-        blocks=_lacks(Need.ATTITUDE),
-    ),
-    Check(
-        Part.ESTIMATOR,
-        lambda r: r.conditions.local_position_invalid,
-        "Preflight Fail: No valid position estimate",
+    _estimate("attitude", events.MODE_ATTITUDE, Need.ATTITUDE, lambda c: c.attitude_invalid),
+    _estimate(
+        "position",
         events.MODE_LOCAL_POSITION,
-        said=False,
-        blocks=_lacks(Need.LOCAL_POSITION | Need.LOCAL_POSITION_RELAXED),
+        Need.LOCAL_POSITION | Need.LOCAL_POSITION_RELAXED,
+        lambda c: c.local_position_invalid,
     ),
-    Check(
-        Part.ESTIMATOR,
-        lambda r: r.conditions.global_position_invalid and not r.conditions.local_position_invalid,
-        "Preflight Fail: No valid global position estimate",
+    _estimate(
+        "global position",
         events.MODE_GLOBAL_POSITION,
-        said=False,
-        blocks=_lacks(Need.GLOBAL_POSITION),
+        Need.GLOBAL_POSITION,
+        lambda c: c.global_position_invalid and not c.local_position_invalid,
     ),
-    Check(
-        Part.ESTIMATOR,
-        lambda r: r.conditions.local_altitude_invalid,
-        "Preflight Fail: No valid altitude estimate",
-        events.MODE_ALTITUDE,
-        said=False,
-        blocks=_lacks(Need.ALTITUDE),
-    ),
+    _estimate("altitude", events.MODE_ALTITUDE, Need.ALTITUDE, lambda c: c.local_altitude_invalid),
     Check(
         Part.SYSTEM,
         lambda r: (
             r.conditions.auto_mission_missing
-            and (bool(r.settings.com_arm_mis_req) or bool(NEEDS[r.mode] & Need.MISSION))
+            and (bool(r.settings.com_arm_mis_req) or _needs(r, Need.MISSION))
         ),
-        "Preflight Fail: No valid mission available",
         events.MODE_MISSION,
         said=False,
     ),
     Check(
         Part.SYSTEM,
-        lambda r: (
-            r.conditions.offboard_control_signal_lost and bool(NEEDS[r.mode] & Need.OFFBOARD_SIGNAL)
-        ),
-        "Preflight Fail: No offboard signal",
+        lambda r: r.conditions.offboard_control_signal_lost and _needs(r, Need.OFFBOARD_SIGNAL),
         events.MODE_OFFBOARD,
         said=False,
     ),
     Check(
         Part.SYSTEM,
-        lambda r: r.conditions.home_position_invalid and bool(NEEDS[r.mode] & Need.HOME),
-        "Preflight Fail: Home position not set",
+        lambda r: r.conditions.home_position_invalid and _needs(r, Need.HOME),
         events.MODE_HOME,
         said=False,
     ),
     Check(
         Part.MANUAL_CONTROL,
-        lambda r: (
-            r.conditions.manual_control_signal_lost and bool(NEEDS[r.mode] & Need.MANUAL_CONTROL)
-        ),
-        "Preflight Fail: No manual control input",
+        lambda r: r.conditions.manual_control_signal_lost and _needs(r, Need.MANUAL_CONTROL),
         events.MODE_MANUAL,
         said=False,
         level=lambda r: Level.ERROR if _no_sticks_wanted(r) else Level.WARNING,

@@ -1,4 +1,4 @@
-"""What the pre-arm checks look at: sensors, estimator, battery and parameters, as plain facts."""
+"""Input of the pre-arm checks: sensors, estimator, battery and parameters, as plain facts."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class ArmingSettings(NamedTuple):
 
 
 class Readiness(NamedTuple):
-    """What the checks look at. No measured number: it is the same until something has changed."""
+    """Input of the checks. No measured number: it is the same until something has changed."""
 
     mode: Mode
     conditions: Conditions

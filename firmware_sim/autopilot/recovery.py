@@ -24,7 +24,7 @@ PROBATION_US = 10 * US_PER_S
 
 
 class Moment(NamedTuple):
-    """When something is decided."""
+    """Moment of a decision."""
 
     time_us: int
     flying: bool

@@ -56,7 +56,7 @@ class OrbitRequest(Request):
 
 
 class LandingTarget(NamedTuple):
-    """What a precision landing lands on."""
+    """Target of a precision landing."""
 
     position: Vec
     """Local NED [m]."""
@@ -83,7 +83,7 @@ class Obstacles(NamedTuple):
 
 
 class FollowedTarget(NamedTuple):
-    """What Follow follows."""
+    """Target of Follow."""
 
     position: Vec
     """Local NED [m]."""

@@ -3,8 +3,8 @@
 PX4's EKF has the terrain among its states. Here it is added when the first range comes, so that
 nothing is spent on it before. The filter of the 16 errors is another one's (`ErrorFilter`); this
 carries the ground's height, its variance and its covariance with the 16 errors. Nothing but a range
-measures the ground, so that the 16 errors are corrected by all else as if there were no such state,
-and the whole equals one filter of 17 states (Simon, Optimal State Estimation, ch. 5 and 7).
+measures the ground, so that the 16 errors are corrected by all else as if there were no such state.
+The whole equals one filter of 17 states (Simon, Optimal State Estimation, ch. 5 and 7).
 Source of the process noise and of how a range is fused: PX4 1.16, EKF/covariance.cpp,
 terrain_control.cpp and range_height_fusion.cpp.
 """

@@ -32,7 +32,7 @@ from firmware_sim.mavlink.udp_links import UdpLinks
 
 @dataclass(frozen=True)
 class Wanted:
-    """What is asked of real firmware."""
+    """Request for real firmware."""
 
     aircraft: Aircraft
     vehicle: VehicleProfile

@@ -1,4 +1,4 @@
-"""Parameters of external firmware as files for the tools of its users."""
+"""Parameters as files: for the tools of users of external firmware, and kept for the next start."""
 
 from __future__ import annotations
 
@@ -7,6 +7,11 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from firmware_sim.external.parameter_client import Value
+from pathlib import Path
+
+from airl_mav.core.errors import UsageError
+from airl_mav.core.files import replace_file
+from airl_mav.profiles.parameters import SPEC_BY_NAME
 
 _INT32, _REAL32 = 6, 9
 """MAV_PARAM_TYPE, as QGroundControl writes it."""
@@ -29,3 +34,51 @@ def qgroundcontrol_file(settings: Mapping[str, Value]) -> str:
         else f"1\t1\t{name}\t{value:.9g}\t{_REAL32}\n"
         for name, value in settings.items()
     )
+
+
+_COLUMNS = 5
+"""Vehicle id, component id, name, value, type: between tabs."""
+
+
+class KeptParameters:
+    """Parameters that users have set, by name. Implements `parameter_store.Keeper`."""
+
+    def __init__(self, path: Path) -> None:
+        """Keep them in a file that may not exist yet, in a folder that does."""
+        self._path = path
+
+    def read(self) -> dict[str, int | float]:
+        """Return what is kept; nothing when there is no file yet.
+
+        Parameters that PX4 has and this flight controller has not are left out.
+
+        Raises:
+            UsageError: The file cannot be read, or is no file of parameters.
+        """
+        try:
+            lines = self._path.read_text(encoding="utf-8").splitlines()
+        except FileNotFoundError:
+            return {}
+        except (OSError, UnicodeDecodeError) as error:
+            raise UsageError(f"{self._path}: cannot be read: {error}") from None
+        values: dict[str, int | float] = {}
+        for number, line in enumerate(lines, start=1):
+            if not line.strip() or line.startswith("#"):
+                continue
+            columns = line.split("\t")
+            try:
+                _, _, name, text, _ = columns
+                spec = SPEC_BY_NAME.get(name)
+                value = int(text) if spec and isinstance(spec.default, int) else float(text)
+            except ValueError:
+                raise UsageError(
+                    f"{self._path}: line {number}: accepted: {_COLUMNS} columns between tabs, "
+                    f"vehicle, component, name, value, type; has {line!r}"
+                ) from None
+            if spec is not None:
+                values[name] = value
+        return values
+
+    def write(self, values: Mapping[str, int | float]) -> None:
+        """Keep these instead. Raises OSError when they cannot be written."""
+        replace_file(self._path, qgroundcontrol_file(values).encode())

@@ -9,12 +9,15 @@ would import pymavlink's own.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import importlib.util
+import io
 import sys
 import tempfile
 from pathlib import Path
 from types import ModuleType
+from xml.etree import ElementTree as Xml
 
 import pymavlink
 
@@ -63,9 +66,6 @@ def generated(folder: Path) -> Path:
     """Return the module's file in a folder. It is made if it is not there."""
     path = folder / f"{_NAME}.py"
     if not path.is_file():
-        # Only here: a start that finds the module must not wait for the generator's import.
-        from firmware_sim.mavlink.dialect_generator import generate
-
         with tempfile.TemporaryDirectory(dir=folder) as temporary:
             made = Path(temporary) / path.name
             generate(NEWER, DEFINITIONS, INCLUDED, made)
@@ -85,3 +85,44 @@ def _imported(path: Path) -> ModuleType:
         del sys.modules[_NAME]
         raise
     return module
+
+
+def generate(newer: Path, definitions: Path, included: tuple[str, ...], module: Path) -> None:
+    """Write the Python module of a dialect.
+
+    Args:
+        newer: Definitions of our own; they take the place of messages with the same number.
+        definitions: Folder of pymavlink's definitions.
+        included: Those of them that belong to the dialect, each including the one before.
+        module: The file to write. The folder must be empty: definitions are put there, too.
+
+    Raises:
+        ImportError: The generator refuses the definitions.
+    """
+    # Only here: a start that finds the module must not wait for the generator's import.
+    from pymavlink.generator import mavgen
+
+    folder = module.parent
+    root = Xml.parse(newer).getroot()  # noqa: S314 (our own file)
+    numbers = {message.get("id") for message in root.iter("message")}
+    for name in included:
+        tree = Xml.parse(definitions / f"{name}.xml")  # noqa: S314 (pymavlink's own file)
+        for messages in tree.getroot().iter("messages"):
+            for message in [m for m in messages if m.get("id") in numbers]:
+                messages.remove(message)
+        tree.write(folder / f"{name}.xml")
+    include, version = Xml.Element("include"), Xml.Element("version")
+    include.text = f"{included[-1]}.xml"
+    version.text = "3"  # HEARTBEAT's mavlink_version, as in minimal.xml
+    root[:0] = [include, version]
+    source = module.with_suffix(".xml")
+    Xml.ElementTree(root).write(source)
+    options = mavgen.Opts(
+        str(module.with_suffix("")), wire_protocol="2.0", language="Python3", validate=False
+    )
+    said = io.StringIO()
+    # Standard output of a process of a rehearsal is its channel to the harness.
+    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+        made = mavgen.mavgen(options, [str(source)])
+    if not made:
+        raise ImportError(f"pymavlink's generator failed: {said.getvalue()}")

@@ -9,9 +9,9 @@ from firmware_sim.autopilot.port import AutopilotPort
 from firmware_sim.interfaces import Truth
 from firmware_sim.mavlink.codec import SYSTEM_ID, Values
 from firmware_sim.mavlink.streams import Builder, information, sensors
-from firmware_sim.mavlink.streams.ground_truth import hil_state_quaternion
+from firmware_sim.mavlink.streams.pose import hil_state_quaternion
+from firmware_sim.mavlink.streams.sensors import VibrationMeter
 from firmware_sim.mavlink.streams.status import manual_control
-from firmware_sim.mavlink.streams.vibration import VibrationMeter
 
 
 class OwnStreams:

@@ -26,9 +26,9 @@ class TextEncoder:
     def encode(self, message: Message) -> list[WireMessage]:
         """Return the messages of one text, in order.
 
-        A text of up to 50 characters is one message with id 0. A longer one is chunks with one
-        id; a chunk with a NUL in it is the last, so a text that fills its last chunk to the brim
-        is followed by an empty one.
+        A text of up to 50 characters is one message with id 0. A longer one is chunks with one id.
+        A chunk with a NUL in it is the last, so a text that fills its last chunk to the brim is
+        followed by an empty one.
         """
         text = message.text.encode("ascii", errors="replace")
         if message.event is not None:

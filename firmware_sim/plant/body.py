@@ -37,12 +37,10 @@ class Body(Protocol):
     @property
     def names(self) -> Mapping[int, str]:
         """Name of each body in a collision event, by number."""
-        ...
 
     @property
     def touch(self) -> Touch:
         """Contacts in the newest tick."""
-        ...
 
     def move(self, at: Vec, force: Vec, torque: Vec, before: Vector, moving_us: int) -> Vector:
         """Move on by one tick.
@@ -57,19 +55,15 @@ class Body(Protocol):
         Returns:
             (16,) the motion after the tick, as `plant.kinematics`; a new array.
         """
-        ...
 
     def follow(self, motion: Vector) -> None:
         """Take the vehicle to be in a motion (16,) that something else has computed."""
-        ...
 
     def look_around(self) -> None:
         """Take what moves to be elsewhere: time has passed without a `move`."""
-        ...
 
     def rest(self) -> Vector:
         """Return the motion (16,) now, the vehicle taken to be at rest or in steady flight."""
-        ...
 
     def put(
         self, position: Vec, velocity: Vec = ..., quaternion: Quat = ..., rates: Vec = ...
@@ -82,11 +76,9 @@ class Body(Protocol):
             quaternion: Body -> NED.
             rates: Angular velocity FRD [rad/s].
         """
-        ...
 
     def close(self) -> None:
         """Release what it holds."""
-        ...
 
 
 def walls_of(arena: Arena) -> list[tuple[str, Vec, Vec]]:

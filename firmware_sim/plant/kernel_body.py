@@ -20,11 +20,15 @@ from firmware_sim.engine.kinematics import WIDTH, quaternion, rates, velocity, w
 from firmware_sim.plant.body import FLOOR, NOTHING, Touch
 from firmware_sim.plant.contacts.box import BREAKING_SHARE, MOST, ROW
 from firmware_sim.plant.contacts.convex import touch_obstacle
-from firmware_sim.plant.contacts.floor import FLOOR_ID, KEPT, touch_floor
-from firmware_sim.plant.contacts.ground import near_ground, touch_ground
+from firmware_sim.plant.contacts.ground import (
+    FLOOR_ID,
+    KEPT,
+    near_ground,
+    touch_floor,
+    touch_ground,
+)
 from firmware_sim.plant.contacts.solver import resolve
-from firmware_sim.plant.solids import Solids, greatest_speed, room_among, solids_of
-from firmware_sim.plant.tours import place_at
+from firmware_sim.plant.solids import Solids, greatest_speed, place_at, room_among, solids_of
 
 _FIRST = FLOOR_ID + 1
 """Number of the first wall or obstacle."""
@@ -147,14 +151,7 @@ class KernelBody:
     def __init__(
         self, arena: Arena | None, body: BodyProfile, airframe: Airframe, tick_s: float
     ) -> None:
-        """Put it at rest on the floor at the start, facing north.
-
-        Args:
-            arena: Where; None = an endless floor.
-            body: Its collision box.
-            airframe: Its mass and inertia.
-            tick_s: Length of a tick [s].
-        """
+        """Put it at rest on the floor at the start, facing north; see `bodies.new_body`."""
         self._solids, names = solids_of(arena)
         self.names: Mapping[int, str] = dict(enumerate([FLOOR, *names], start=FLOOR_ID))
         self._half = np.array([0.5 * body.width_m, 0.5 * body.width_m, 0.5 * body.height_m])

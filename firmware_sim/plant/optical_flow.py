@@ -13,7 +13,7 @@ from airl_mav.profiles.sensors import OpticalFlow
 from airl_mav.vehicle.rotation import conjugate, rotate
 from firmware_sim.engine.kinematics import POSITION, QUATERNION, quaternion, rates, velocity
 from firmware_sim.interfaces import FlowReading
-from firmware_sim.plant.downward_ray import DownwardRay
+from firmware_sim.plant.rangefinder import DownwardRay
 from firmware_sim.plant.sensors import Rate, White
 
 BEST, INVALID = 255, 0

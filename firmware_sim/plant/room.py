@@ -13,8 +13,7 @@ from airl_mav.core.kernels import kernel
 from airl_mav.profiles.vehicle import Body
 from firmware_sim.engine.kinematics import quaternion
 from firmware_sim.plant.contacts.box import reach_along
-from firmware_sim.plant.solids import Solids, greatest_speed, room_among, solids_of
-from firmware_sim.plant.tours import place_at
+from firmware_sim.plant.solids import Solids, greatest_speed, place_at, room_among, solids_of
 
 
 class Room:

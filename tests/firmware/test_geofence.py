@@ -12,12 +12,18 @@ from hypothesis import strategies as st
 
 from airl_mav.core.frames import Geodetic
 from firmware_sim.autopilot.autopilot_state import Message, Mode, Result
-from firmware_sim.autopilot.navigation.fence import Circle, Polygon, all_allow, areas
-from firmware_sim.autopilot.navigation.fence_monitor import PERIOD_US, FenceMonitor
-from firmware_sim.autopilot.navigation.fence_prediction import braking_distance
+from firmware_sim.autopilot.navigation.fence import (
+    PERIOD_US,
+    Circle,
+    FenceMonitor,
+    Polygon,
+    all_allow,
+    areas,
+    braking_distance,
+)
 from firmware_sim.autopilot.navigation.flown_item import Situation
 from firmware_sim.autopilot.navigation.plan import Kind, NavCommand, PlanItem, Plans
-from firmware_sim.autopilot.navigation.rally import destination
+from firmware_sim.autopilot.navigation.way_home import destination
 from firmware_sim.autopilot.requests import Place, Reposition
 from tests.support.flight_rig import Rig, velocity_setpoint
 from tests.support.mission_kit import DEFAULTS, ORIGIN, at, place

@@ -20,11 +20,11 @@ from airl_mav.envs.arenas import NOTHING, touches
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from firmware_sim.interfaces import ActuatorControls
+from firmware_sim.plant.bullet_body import World
 from firmware_sim.plant.contacts.box import BREAKING_SHARE, MOST, ROW
 from firmware_sim.plant.contacts.ground import near_ground, touch_ground
 from firmware_sim.plant.plant import Plant
 from firmware_sim.plant.rangefinder import PlantRangefinder
-from firmware_sim.plant.world import World
 from tests.firmware.test_kernel_body import HALF, HEIGHT, both
 from tests.firmware.test_rangefinder_plant import QUIET
 from tests.firmware.test_world import OFF

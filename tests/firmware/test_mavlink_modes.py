@@ -9,7 +9,7 @@ import pytest
 from firmware_sim.autopilot.autopilot_state import Mode
 from firmware_sim.autopilot.mode_numbers import custom_mode
 from firmware_sim.mavlink.codec import dialect
-from firmware_sim.mavlink.streams.flight_modes import KNOWN, existing
+from firmware_sim.mavlink.streams.information import KNOWN, existing
 from tests.support.mavlink_clients import Rig
 
 REQUEST_MESSAGE, SET_STANDARD_MODE = 512, 262

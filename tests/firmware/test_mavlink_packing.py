@@ -21,8 +21,7 @@ from firmware_sim.interfaces import BatterySample
 from firmware_sim.mavlink.codec import SYSTEM_ID, Encoder, Layout, Values, dialect, layout
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from firmware_sim.mavlink.link import Link, Payloads, onboard_link
-from firmware_sim.mavlink.streams import BUILDERS, units
-from firmware_sim.mavlink.streams.silent import SILENT
+from firmware_sim.mavlink.streams import BUILDERS, SILENT, units
 from firmware_sim.mavlink.telemetry import payload
 from tests.support.kinematic_autopilot import ORIGIN, KinematicAutopilot
 from tests.support.mavlink_clients import Bench

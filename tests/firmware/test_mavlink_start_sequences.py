@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from firmware_sim.mavlink.codec import dialect
-from firmware_sim.mavlink.crc32 import crc32part
+from firmware_sim.mavlink.services.transfers import crc32part
 from tests.support.mavlink_clients import Rig
 
 MISSION, FENCE, RALLY = 0, 1, 2

@@ -27,10 +27,10 @@ from firmware_sim.autopilot.optical_flow import STUCK, OpticalFlow, flow_by_erro
 from firmware_sim.crash_detector import TOUCHDOWN_M_S
 from firmware_sim.engine.kinematics import WIDTH
 from firmware_sim.external.px4 import hil_messages as hil
-from firmware_sim.flight_log import values
+from firmware_sim.flight_log import topics
 from firmware_sim.interfaces import FlowReading, SensorSample
 from firmware_sim.mavlink.codec import Encoder, layout
-from firmware_sim.mavlink.streams.optical_flow import optical_flow_rad
+from firmware_sim.mavlink.streams.distance import optical_flow_rad
 from firmware_sim.mavlink.telemetry import payload
 from firmware_sim.plant.optical_flow import BEST, INVALID, PlantOpticalFlow
 from tests.support import mavlink_clients
@@ -386,7 +386,7 @@ def test_what_clients_and_the_log_are_told() -> None:
     assert (message.quality, message.distance) == (BEST, -1.0)
     # The sensor has no gyro: the vehicle's turn stands in.
     assert np.isfinite(sent[5:8]).all() and sent[5:8] == tuple(told.turned.tolist())
-    logged = values.optical_flow(values.Moment(state, rig.truth, 0))
+    logged = topics.optical_flow(topics.Moment(state, rig.truth, 0))
     assert logged is not None
     assert logged[2:4] == tuple(told.flow.tolist()) and logged[8] == 20_000
     tampered(rig, lambda _: None)

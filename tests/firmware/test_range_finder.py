@@ -30,7 +30,7 @@ from firmware_sim.crash_detector import TOUCHDOWN_M_S
 from firmware_sim.engine.record import LANDING, new_controller
 from firmware_sim.engine.ticks import detect_record
 from firmware_sim.external.px4 import hil_messages as hil
-from firmware_sim.flight_log import values
+from firmware_sim.flight_log import topics
 from firmware_sim.interfaces import DOWNWARD, DistanceReading, SensorSample
 from firmware_sim.mavlink.codec import Encoder
 from firmware_sim.mavlink.streams import distance, status
@@ -140,7 +140,7 @@ def test_a_flight_over_a_box() -> None:
     sent_status = status.estimator_status(state)
     assert sent_status[1] & dialect.ESTIMATOR_POS_VERT_AGL
     assert 0.0 < sent_status[6] < 1.0
-    logged = values.local_position(values.Moment(state, rig.truth, 0))
+    logged = topics.local_position(topics.Moment(state, rig.truth, 0))
     assert logged[-5:] == (
         ground.dist_bottom_m,
         ground.variance_m2,

@@ -43,7 +43,7 @@ def arena_of(name: str, seed: int = 3) -> Arena:
 @pytest.mark.parametrize("name", ["static-obstacles", "dynamic-obstacles"])
 def test_rays_are_pybullet_s(name: str) -> None:
     pybullet = pytest.importorskip("pybullet")
-    from firmware_sim.plant.world import World
+    from firmware_sim.plant.bullet_body import World
 
     arena = arena_of(name)
     world = World(arena, 0.3)

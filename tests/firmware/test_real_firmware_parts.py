@@ -36,8 +36,7 @@ from firmware_sim.external.airframe_check import (
 )
 from firmware_sim.external.ardupilot.program import PARAMETERS, Links, find_arducopter
 from firmware_sim.external.ardupilot.program import start as start_arducopter
-from firmware_sim.external.bridge import Bridge
-from firmware_sim.external.launcher import Launcher
+from firmware_sim.external.launcher import Bridge, Launcher
 from firmware_sim.external.observer import Observer, flight_of
 from firmware_sim.external.parameter_client import ParameterClient, same
 from firmware_sim.external.process import FirmwareProcess, StartCommand, WorkingFolders

@@ -18,8 +18,8 @@ from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.scenario.aircraft import Aircraft
 from firmware_sim.interfaces import ActuatorControls
+from firmware_sim.plant.bullet_body import World, facing
 from firmware_sim.plant.plant import REST_SPEED_M_S, Plant
-from firmware_sim.plant.world import World, facing
 from tests.support.flight_rig import quad
 
 STILL = {"linear_n_s_m": 0.0, "quadratic_n_s2_m2": 0.0, "angular_n_m_s": 0.0}

@@ -30,8 +30,7 @@ from airl_mav.vehicle.airframe import draw_airframe
 from airl_mav.vehicle.rotation import rotate
 from airl_mav.vehicle.wind import BLOCK, wind_of_episode
 from firmware_sim.interfaces import BatterySample
-from firmware_sim.plant.bullet import pybullet
-from firmware_sim.plant.bullet_body import BulletBody
+from firmware_sim.plant.bullet_body import BulletBody, pybullet
 from firmware_sim.plant.camera_server import SimulatedCamera
 from firmware_sim.plant.sensors import SensorSuite
 from firmware_sim.simulation import EpisodeSetup, Simulation

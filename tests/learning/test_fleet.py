@@ -38,7 +38,7 @@ from airl_mav.vehicle.airframe import Airframe
 from airl_mav.vehicle.power import level_power_w
 from firmware_sim.autopilot.parameter_store import Parameters
 from firmware_sim.interfaces import ActuatorControls
-from firmware_sim.plant.bullet import connect, pybullet
+from firmware_sim.plant.bullet_body import connect, pybullet
 from firmware_sim.plant.plant import Plant
 
 QUAD = load_profile("vehicles", "quad", VehicleProfile)

@@ -25,7 +25,7 @@ from airl_mav.envs.arenas import NOTHING, WALL, touches
 from airl_mav.profiles.appearance import MATERIALS
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
-from firmware_sim.plant.world import World
+from firmware_sim.plant.bullet_body import World
 
 WIDTH_M = 1.0
 SEEDS = range(6)

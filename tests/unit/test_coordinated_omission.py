@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from airl_mav.latency.autocorrelation import autocorrelation, integrated_time
 from airl_mav.latency.coordinated_omission import (
     CommandAges,
     ages_in_closed_loop,
     command_ages,
     corrected,
 )
+from airl_mav.latency.percentiles import autocorrelation, integrated_time
 
 MS = 1_000
 

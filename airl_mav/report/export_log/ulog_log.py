@@ -18,10 +18,10 @@ from airl_mav.latency.stamps import ATTITUDE, RATES, SETPOINT
 from airl_mav.report.export_log.recorded import RecordedFlight, charge_of
 from airl_mav.report.replay.flight import INFO, STANDING_M, WARNING
 from firmware_sim.autopilot.autopilot_state import Mode
+from firmware_sim.autopilot.mode_numbers import NAVIGATION_STATES
 from firmware_sim.flight_log.flight_log import DESCRIBED
-from firmware_sim.flight_log.topics import ON_CHANGE_US, TOPICS
+from firmware_sim.flight_log.topics import ARMED, DISARMED, ON_CHANGE_US, ROTARY_WING, TOPICS
 from firmware_sim.flight_log.ulog import Topic, UlogWriter, Values
-from firmware_sim.flight_log.values import ARMED, DISARMED, NAVIGATION_STATES, ROTARY_WING
 
 _LOGGED = {logged.topic.name: logged for logged in TOPICS}
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 from firmware_sim.autopilot.events.definition import Argument, Definition, Level, arguments
 from firmware_sim.autopilot.events.enumerations import Component
 
-_ABOUT = arguments("navigation_mode_group_t modes", "uint8_t health_component_index")
+_ABOUT = arguments("navigation_mode_group_t modes, uint8_t health_component_index")
 """What every check says first: modes it is about, part of the vehicle."""
 
 _FIRST = arguments("uint8_t instance")
@@ -120,9 +120,7 @@ _MAG_INTERFERENCE = Definition(
     "check_estimator_mag_interference",
     "Strong magnetic interference",
     _ABOUT
-    + arguments(
-        "float strength", "float strength_ref", "float inclination", "float inclination_ref"
-    ),
+    + arguments("float strength, float strength_ref, float inclination, float inclination_ref"),
     Level.WARNING,
     description="Configured by <param>COM_ARM_MAG_STR</param>.",
     group="arming_check",
@@ -238,31 +236,22 @@ MODE_MANUAL = _check(
     "Connect sticks, or choose a mode that needs none.",
 )
 
-_SUMMARY = (Level.PROTOCOL, None, "")
-ARMING_SUMMARY = Definition(
+
+def _summary(name: str, message: str, group: str, listed: str) -> Definition:
+    return Definition(name, message, arguments(listed), Level.PROTOCOL, None, "", group, "summary")
+
+
+ARMING_SUMMARY = _summary(
     "commander_arming_check_summary",
     "Arming check summary event",
-    arguments(
-        "uint8_t chunk_idx",
-        "health_component_t error",
-        "health_component_t warning",
-        "navigation_mode_group_t can_arm",
-        "navigation_mode_group_t can_run",
-    ),
-    *_SUMMARY,
     "arming_check",
-    "summary",
+    "uint8_t chunk_idx, health_component_t error, health_component_t warning, "
+    "navigation_mode_group_t can_arm, navigation_mode_group_t can_run",
 )
-HEALTH_SUMMARY = Definition(
+HEALTH_SUMMARY = _summary(
     "commander_health_summary",
     "Health report summary event",
-    arguments(
-        "uint8_t chunk_idx",
-        "health_component_t is_present",
-        "health_component_t error",
-        "health_component_t warning",
-    ),
-    *_SUMMARY,
     "health",
-    "summary",
+    "uint8_t chunk_idx, health_component_t is_present, health_component_t error, "
+    "health_component_t warning",
 )

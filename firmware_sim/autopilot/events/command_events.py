@@ -6,19 +6,17 @@ mavlink/mavlink_receiver.cpp, navigator/navigator_main.cpp, flight_mode_manager/
 
 from __future__ import annotations
 
-from firmware_sim.autopilot.events.definition import Level, critical, define, error
+from firmware_sim.autopilot.events.definition import Level, critical, define, error, wrong
 
 # --- commands
 
-ARM_PARAMETER = define(
-    "commander_unsupported_arm_disarm_param",
-    "Unsupported ARM_DISARM param: {1:.3}",
-    "float param1",
-    level=Level.ERROR,
+ARM_PARAMETER = wrong(
+    "commander_unsupported_arm_disarm_param", "Unsupported ARM_DISARM param: {1:.3}", "float param1"
 )
 ARM_WHILE_CALIBRATING = critical("commander_arm_denied_calibrating", "Arming denied: calibrating")
-AUTO_MODE_UNSUPPORTED = define(
-    "commander_unsupported_auto_mode", "Unsupported auto mode", level=Level.ERROR
+AUTO_MODE_UNSUPPORTED = wrong(
+    "commander_unsupported_auto_mode",
+    "Unsupported auto mode",
 )
 NO_HIGH_LATENCY = critical(
     "commander_ctrl_high_latency_failed", "Control high latency failed! Telemetry unavailable"
@@ -33,51 +31,39 @@ ORBIT_TOO_WIDE = define("orbit_radius_exceeded", "Orbit radius limit exceeded", 
 
 # --- setpoints and targets
 
-LOCAL_FRAME = define(
+LOCAL_FRAME = wrong(
     "mavlink_rcv_sp_target_unsup_coord",
     "SET_POSITION_TARGET_LOCAL_NED: coordinate frame {1} unsupported",
     "uint8_t coordinate_frame",
-    level=Level.ERROR,
 )
-LOCAL_FORCE = define(
-    "mavlink_rcv_sp_target_unsup_force",
-    "SET_POSITION_TARGET_LOCAL_NED: FORCE is not supported",
-    level=Level.ERROR,
+LOCAL_FORCE = wrong(
+    "mavlink_rcv_sp_target_unsup_force", "SET_POSITION_TARGET_LOCAL_NED: FORCE is not supported"
 )
-LOCAL_INVALID = define(
+LOCAL_INVALID = wrong(
     "mavlink_rcv_sp_target_invalid",
     "SET_POSITION_TARGET_LOCAL_NED: invalid, missing position, velocity or acceleration",
-    level=Level.ERROR,
 )
-GLOBAL_FRAME = define(
+GLOBAL_FRAME = wrong(
     "mavlink_rcv_sp_target_gl_invalid_coord",
     "SET_POSITION_TARGET_GLOBAL_INT invalid coordinate frame {1}",
     "uint8_t coordinate_frame",
-    level=Level.ERROR,
 )
-GLOBAL_FORCE = define(
-    "mavlink_rcv_sp_target_gl_unsup_force",
-    "SET_POSITION_TARGET_GLOBAL_INT: FORCE is not supported",
-    level=Level.ERROR,
+GLOBAL_FORCE = wrong(
+    "mavlink_rcv_sp_target_gl_unsup_force", "SET_POSITION_TARGET_GLOBAL_INT: FORCE is not supported"
 )
-LANDING_TARGET_FRAME = define(
+LANDING_TARGET_FRAME = wrong(
     "mavlink_rcv_lnd_target_unsup_coord",
     "Landing target: unsupported coordinate frame {1}",
     "uint8_t frame",
-    level=Level.ERROR,
 )
 
-OBSTACLE_FRAME = define(
-    "col_prev_unsup_frame",
-    "Obstacle message received in unsupported frame {1}",
-    "uint8_t frame",
-    level=Level.ERROR,
+OBSTACLE_FRAME = wrong(
+    "col_prev_unsup_frame", "Obstacle message received in unsupported frame {1}", "uint8_t frame"
 )
-ODOMETRY_ESTIMATOR = define(
+ODOMETRY_ESTIMATOR = wrong(
     "mavlink_rcv_odom_unsup_estimator_type",
     "ODOMETRY: unsupported estimator_type {1}",
     "uint8_t estimator_type",
-    level=Level.ERROR,
 )
 
 # --- calibrations

@@ -111,26 +111,27 @@ def sub_id(name: str) -> int:
     return value & 0xFFFFFF
 
 
-def arguments(*kinds_and_names: str) -> tuple[Argument, ...]:
-    """Return arguments of "type name" each."""
-    return tuple(Argument(*text.split()) for text in kinds_and_names)
+def arguments(listed: str) -> tuple[Argument, ...]:
+    """Return the arguments of "type name, type name"."""
+    return tuple(Argument(*text.split()) for text in listed.split(", ") if text)
 
 
 def define(
     name: str,
     message: str,
-    *listed: str,
+    listed: str = "",
     level: Level = Level.INFO,
     internal: Level | None = None,
     description: str = "",
     kind: str = "",
 ) -> Definition:
-    """Return a definition with arguments of "type name" each."""
+    """Return a definition with arguments of "type name, type name"."""
     return Definition(
-        name, message, arguments(*listed), level, internal, description=description, kind=kind
+        name, message, arguments(listed), level, internal, description=description, kind=kind
     )
 
 
+wrong = partial(define, level=Level.ERROR)
 critical = partial(define, level=Level.CRITICAL, internal=Level.INFO)
 error = partial(define, level=Level.ERROR, internal=Level.INFO)
 warning = partial(define, level=Level.WARNING, internal=Level.INFO)

@@ -71,24 +71,14 @@ class Component(IntEnum):
         return self.value.bit_length() - 1
 
 
-class ArmingReason(IntEnum):
-    """Why the vehicle was armed or disarmed."""
-
-    TRANSITION_TO_STANDBY = 0
-    STICK_GESTURE = 1
-    RC_SWITCH = 2
-    COMMAND_INTERNAL = 3
-    COMMAND_EXTERNAL = 4
-    MISSION_START = 5
-    AUTO_DISARM_LAND = 6
-    AUTO_DISARM_PREFLIGHT = 7
-    KILL_SWITCH = 8
-    LOCKDOWN = 9
-    FAILURE_DETECTOR = 10
-    SHUTDOWN = 11
-    UNIT_TEST = 12
-    RC_BUTTON = 13
-    FAILSAFE = 14
+ArmingReason = IntEnum(
+    "ArmingReason",
+    "TRANSITION_TO_STANDBY STICK_GESTURE RC_SWITCH COMMAND_INTERNAL COMMAND_EXTERNAL "
+    "MISSION_START AUTO_DISARM_LAND AUTO_DISARM_PREFLIGHT KILL_SWITCH LOCKDOWN "
+    "FAILURE_DETECTOR SHUTDOWN UNIT_TEST RC_BUTTON FAILSAFE",
+    start=0,
+)
+"""Why the vehicle was armed or disarmed."""
 
 
 class NavigationMode(IntEnum):
@@ -121,28 +111,17 @@ class NavigationMode(IntEnum):
     UNKNOWN = 255
 
 
-class FailsafeAction(IntEnum):
-    """Actions of a failsafe: the numbers of `failsafes.actions.Action`."""
-
-    NONE = 0
-    WARN = 1
-    FALLBACK_POSCTRL = 2
-    FALLBACK_ALTCTRL = 3
-    FALLBACK_STABILIZED = 4
-    HOLD = 5
-    RTL = 6
-    LAND = 7
-    DESCEND = 8
-    DISARM = 9
-    TERMINATE = 10
+FailsafeAction = IntEnum(
+    "FailsafeAction",
+    "NONE WARN FALLBACK_POSCTRL FALLBACK_ALTCTRL FALLBACK_STABILIZED HOLD RTL LAND DESCEND "
+    "DISARM TERMINATE",
+    start=0,
+)
+"""Actions of a failsafe: the numbers of `failsafes.actions.Action`."""
 
 
-class SensorType(IntEnum):
-    """Inertial sensors that a message names."""
-
-    ACCEL = 0
-    GYRO = 1
-    MAG = 2
+SensorType = IntEnum("SensorType", "ACCEL GYRO MAG", start=0)
+"""Inertial sensors that a message names."""
 
 
 class SensorFailure(IntEnum):
@@ -155,16 +134,13 @@ class SensorFailure(IntEnum):
     HIGH_ERROR_DENSITY = 16
 
 
-class FailsafeCause(IntEnum):
-    """Causes in a failsafe's message: in the order of `failsafes.actions.Cause`."""
-
-    GENERIC = 0
-    MANUAL_CONTROL_LOSS = 1
-    GCS_CONNECTION_LOSS = 2
-    LOW_BATTERY_LEVEL = 3
-    CRITICAL_BATTERY_LEVEL = 4
-    EMERGENCY_BATTERY_LEVEL = 5
-    LOW_REMAINING_FLIGHT_TIME = 6
+FailsafeCause = IntEnum(
+    "FailsafeCause",
+    "GENERIC MANUAL_CONTROL_LOSS GCS_CONNECTION_LOSS LOW_BATTERY_LEVEL CRITICAL_BATTERY_LEVEL "
+    "EMERGENCY_BATTERY_LEVEL LOW_REMAINING_FLIGHT_TIME",
+    start=0,
+)
+"""Causes in a failsafe's message: in the order of `failsafes.actions.Cause`."""
 
 
 class Enumeration(NamedTuple):

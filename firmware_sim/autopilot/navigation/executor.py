@@ -1,7 +1,8 @@
 """Flies a stored mission, item by item: PX4's navigator in Mission mode.
 
 Source of the order of events, conditions and texts: PX4 1.16, MissionBase, Mission and
-MissionBlock, as they treat a multicopter. It runs at `PERIOD_US`, as PX4's navigator does.
+MissionBlock, as they treat a multicopter; of the region of interest: Navigator (vehicle_roi) and
+MissionBase::heading_sp_update. It runs at `PERIOD_US`, as PX4's navigator does.
 """
 
 from __future__ import annotations
@@ -11,12 +12,11 @@ from collections.abc import Callable
 from enum import Enum, auto
 from typing import Protocol
 
-from airl_mav.core.frames import Geodetic
+from airl_mav.core.frames import Geodetic, wrap_pi
 from airl_mav.vehicle.rotation import Vec
 from firmware_sim.autopilot.autopilot_state import Message, Severity
 from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.events.definition import Event
-from firmware_sim.autopilot.navigation import jumps
 from firmware_sim.autopilot.navigation.feasibility import Verdict
 from firmware_sim.autopilot.navigation.flown_item import (
     Arrival,
@@ -24,9 +24,77 @@ from firmware_sim.autopilot.navigation.flown_item import (
     Situation,
     as_flown,
 )
-from firmware_sim.autopilot.navigation.plan import Kind, NavCommand, PlanItem, Plans
-from firmware_sim.autopilot.navigation.roi import RegionOfInterest
+from firmware_sim.autopilot.navigation.plan import (
+    Frame,
+    Kind,
+    NavCommand,
+    PlanItem,
+    Plans,
+    go_to,
+    next_places,
+)
 from firmware_sim.autopilot.navigation.triplet import STANDING, Triplet, TripletKind
+
+_MODE_LOCATION = 3
+"""MAV_ROI_LOCATION."""
+
+
+class _Look(Enum):
+    NOWHERE = auto()
+    PLACE = auto()
+    WAYPOINT = auto()
+
+
+class RegionOfInterest:
+    """Region of interest."""
+
+    def __init__(self) -> None:
+        self._look = _Look.NOWHERE
+        self._place = Geodetic(0.0, 0.0, 0.0)
+        self._offset = 0.0
+
+    def reset(self) -> None:
+        """Look at nothing in particular."""
+        self._look = _Look.NOWHERE
+
+    def look_at(self, place: Geodetic) -> None:
+        """Look at a place (MAV_CMD_DO_SET_ROI_LOCATION)."""
+        self._look, self._place = _Look.PLACE, place
+
+    def command(self, item: PlanItem) -> None:
+        """Carry out a mission item, where it is about the region of interest."""
+        if item.command == NavCommand.DO_SET_ROI_NONE:
+            self.reset()
+        elif item.command == NavCommand.DO_SET_ROI_LOCATION:
+            self.look_at(Geodetic(item.x, item.y, item.z))
+        elif item.command == NavCommand.DO_SET_ROI_WPNEXT_OFFSET:
+            offset = math.radians(item.z)
+            self._look = _Look.WAYPOINT
+            self._offset = offset if math.isfinite(offset) else 0.0
+        elif item.command == NavCommand.DO_SET_ROI:
+            located = item.frame != Frame.MISSION and item.params[0] == _MODE_LOCATION
+            if located:
+                self.look_at(Geodetic(item.x, item.y, item.z))
+            else:
+                self.reset()
+
+    def heading(
+        self, position: Vec, target: Vec, local: Callable[[Geodetic], Vec], nearest_m: float
+    ) -> float | None:
+        """Return the heading [rad] towards it; None = any, or it is nearer than `nearest_m`.
+
+        `position` and `target`, where the vehicle is flying to, are local NED [m], and `local`
+        turns a place into that.
+        """
+        if self._look is _Look.NOWHERE:
+            return None
+        at = local(self._place) if self._look is _Look.PLACE else target
+        north, east = at[0] - position[0], at[1] - position[1]
+        if math.hypot(north, east) <= nearest_m:
+            return None
+        offset = self._offset if self._look is _Look.WAYPOINT else 0.0
+        return wrap_pi(math.atan2(east, north) + offset)
+
 
 _N = NavCommand
 NAN = math.nan
@@ -42,15 +110,12 @@ class Crew(Protocol):
 
     def say(self, message: Message, /) -> None:
         """Tell the operator."""
-        ...
 
     def set_home(self, place: Geodetic | None, /) -> object:
         """Move home; None = to the present place."""
-        ...
 
     def return_to_launch(self) -> None:
         """End the mission and return."""
-        ...
 
 
 class _Work(Enum):
@@ -204,7 +269,7 @@ class MissionExecutor:
     def _climb_first(self, situation: Situation) -> None:
         """Find out whether the vehicle must climb before it sets out."""
         self._climb_down = NAN
-        following = jumps.next_places(self._plans, self._plans.current, 1)
+        following = next_places(self._plans, self._plans.current, 1)
         if self._running and following and self._climbs_first:
             down = self._place(following[0], situation)[2]
             if situation.position[2] - down > self._value("NAV_MC_ALT_RAD"):
@@ -222,7 +287,7 @@ class MissionExecutor:
     def _advance(self, situation: Situation) -> None:
         """Go on to the next item, or end the mission."""
         if self._work is _Work.ITEM:
-            following = jumps.go_to(self._plans, self._plans.current + 1)
+            following = go_to(self._plans, self._plans.current + 1)
             if following is None:
                 landed = situation.landed
                 end = events.MISSION_FINISHED if landed else events.MISSION_FINISHED_LOITER
@@ -257,7 +322,7 @@ class MissionExecutor:
         plans = self._plans
         item = plans.mission[plans.current]
         flown = self._flown = as_flown(item, self._place(item, situation))
-        following = jumps.next_places(plans, plans.current + 1, 2)
+        following = next_places(plans, plans.current + 1, 2)
         places = [self._place(place, situation) for place in following]
         work, old = _Work.ITEM, self.triplet
         if item.has_position:

@@ -11,24 +11,17 @@ from typing import NamedTuple
 
 from airl_mav.core.frames import Geodetic
 from firmware_sim.autopilot.autopilot_state import Message, Severity
-from firmware_sim.autopilot.events import mission_events as events
+from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.events.definition import Definition
-from firmware_sim.autopilot.navigation.geography import distance_m
-from firmware_sim.autopilot.navigation.plan import NavCommand, PlanItem
+from firmware_sim.autopilot.navigation.plan import NOT_IN_MISSIONS, NavCommand, PlanItem, distance_m
 
 _N = NavCommand
 
-FLYABLE = frozenset(_N) - {
-    _N.ROI,
-    _N.CONDITION_DELAY,
-    _N.CONDITION_DISTANCE,
-    _N.FENCE_RETURN_POINT,
-    _N.FENCE_POLYGON_VERTEX_INCLUSION,
-    _N.FENCE_POLYGON_VERTEX_EXCLUSION,
-    _N.FENCE_CIRCLE_INCLUSION,
-    _N.FENCE_CIRCLE_EXCLUSION,
-    _N.RALLY_POINT,
-}
+FLYABLE = (
+    frozenset(_N)
+    - {_N.ROI, _N.CONDITION_DELAY, _N.CONDITION_DISTANCE, _N.FENCE_RETURN_POINT}
+    - NOT_IN_MISSIONS
+)
 """Commands that a mission may consist of; the others are stored, and the mission is rejected."""
 
 _VTOL = (_N.VTOL_TAKEOFF, _N.VTOL_LAND, _N.DO_VTOL_TRANSITION)
@@ -42,7 +35,7 @@ _NEVER_FIRST = frozenset(
 
 
 class Verdict(NamedTuple):
-    """What the checks found."""
+    """Result of the checks."""
 
     valid: bool
     messages: tuple[Message, ...] = ()

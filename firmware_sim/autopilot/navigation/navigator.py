@@ -17,16 +17,17 @@ from firmware_sim.autopilot.failsafes.watch import Reports
 from firmware_sim.autopilot.modes.interface import FlightContext
 from firmware_sim.autopilot.navigation.executor import PERIOD_US, Crew, MissionExecutor
 from firmware_sim.autopilot.navigation.feasibility import Verdict, check
-from firmware_sim.autopilot.navigation.fence_monitor import FenceMonitor
+from firmware_sim.autopilot.navigation.fence import FenceMonitor
 from firmware_sim.autopilot.navigation.flown_item import Situation
-from firmware_sim.autopilot.navigation.geography import distance_m
-from firmware_sim.autopilot.navigation.plan import Kind, PlanItem, Plans
-from firmware_sim.autopilot.navigation.rally import Destination, ReturnType, destination
+from firmware_sim.autopilot.navigation.plan import Kind, PlanItem, Plans, distance_m
 from firmware_sim.autopilot.navigation.return_path import return_height, return_time_s
 from firmware_sim.autopilot.navigation.triplet import STANDING, Triplet
 from firmware_sim.autopilot.navigation.way_home import (
+    Destination,
+    ReturnType,
     along_mission,
     climb,
+    destination,
     landing_start,
     onwards,
 )

@@ -1,14 +1,17 @@
-"""What a ground station stores aboard: the mission, the geofence, rally points.
+"""What a ground station stores aboard: the mission, the geofence, rally points; jumps, distances.
 
-Source of commands, frames and limits: MAVLink common.xml and PX4 1.16 (navigation.h, dataman.h).
+Source of commands, frames and limits: MAVLink common.xml and PX4 1.16 (navigation.h, dataman.h);
+of jumps: MissionBase::getNonJumpItem, getNextPositionItems.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple
 
+from airl_mav.core.constants import EARTH_RADIUS_M
 from airl_mav.core.frames import Geodetic
 
 
@@ -65,6 +68,18 @@ class NavCommand(IntEnum):
     FENCE_CIRCLE_EXCLUSION = 5004
     RALLY_POINT = 5100
     DO_WINCH = 42600
+
+
+NOT_IN_MISSIONS = frozenset(
+    {
+        NavCommand.FENCE_POLYGON_VERTEX_INCLUSION,
+        NavCommand.FENCE_POLYGON_VERTEX_EXCLUSION,
+        NavCommand.FENCE_CIRCLE_INCLUSION,
+        NavCommand.FENCE_CIRCLE_EXCLUSION,
+        NavCommand.RALLY_POINT,
+    }
+)
+"""Points of a fence and rally points."""
 
 
 class Frame(IntEnum):
@@ -210,3 +225,77 @@ class Plans:
         self.current = index
         self.set_current_count += 1
         self.changes += 1
+
+
+def distance_m(a: tuple[float, float], b: tuple[float, float]) -> float:
+    """Return the great-circle distance [m] between two places (latitude, longitude) [deg].
+
+    Haversine on a sphere, as PX4's get_distance_to_next_waypoint.
+    """
+    lat_a, lat_b = math.radians(a[0]), math.radians(b[0])
+    half_lat = math.sin(0.5 * (lat_b - lat_a))
+    half_lon = math.sin(0.5 * math.radians(b[1] - a[1]))
+    h = half_lat * half_lat + half_lon * half_lon * math.cos(lat_a) * math.cos(lat_b)
+    return EARTH_RADIUS_M * 2.0 * math.atan2(math.sqrt(h), math.sqrt(max(0.0, 1.0 - h)))
+
+
+MOST_JUMPS = 10
+"""After so many jumps in a row the search ends at a jump (PX4's MAX_JUMP_ITERATION)."""
+
+
+def resolve(plans: Plans, index: int, *, count: bool) -> int | None:
+    """Return the index of the item that is flown instead of a DO_JUMP; others are themselves.
+
+    Args:
+        plans: The mission, and how often its jumps have been carried out.
+        index: Where to begin.
+        count: Whether jumps count as carried out.
+
+    Returns:
+        None where the mission ends, or where a jump leads out of it.
+    """
+    items = plans.mission
+    for _ in range(MOST_JUMPS):
+        if not 0 <= index < len(items):
+            return None
+        item = items[index]
+        if item.command != NavCommand.DO_JUMP:
+            return index
+        target, repeats = _whole(item.params[0]), _whole(item.params[1])
+        if not 0 <= target < len(items):
+            return None
+        done = plans.jumps_done.get(index, 0)
+        if done < repeats:
+            if count:
+                plans.jumps_done[index] = done + 1
+                plans.jumped = index
+            index = target
+        else:
+            index += 1
+    return index if 0 <= index < len(items) else None
+
+
+def go_to(plans: Plans, index: int) -> int | None:
+    """Return the item to fly for an index, and count the jumps to it; None = there is none."""
+    return resolve(plans, index, count=True)
+
+
+def next_places(plans: Plans, index: int, most: int) -> list[PlanItem]:
+    """Return the next items with a place from an index on, at most so many."""
+    found: list[PlanItem] = []
+    # Each item is looked at once, so that a jump back and forth ends.
+    for _ in range(2 * len(plans.mission)):
+        if len(found) == most:
+            break
+        following = resolve(plans, index, count=False)
+        if following is None:
+            break
+        if plans.mission[following].has_position:
+            found.append(plans.mission[following])
+        index = following + 1
+    return found
+
+
+def _whole(value: float) -> int:
+    """Return a number of the wire as PX4 does, towards zero; what is none is -1."""
+    return int(value) if abs(value) < 65_536.0 else -1

@@ -1,4 +1,4 @@
-"""What is reported of the plans."""
+"""Progress of the plans."""
 
 from __future__ import annotations
 

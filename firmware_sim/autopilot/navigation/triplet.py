@@ -10,7 +10,7 @@ from airl_mav.vehicle.rotation import Vec
 
 
 class TripletKind(Enum):
-    """How a triplet is flown."""
+    """Manner in which a triplet is flown."""
 
     IDLE = auto()
     """Not at all: the vehicle stands."""

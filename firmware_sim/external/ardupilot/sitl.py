@@ -18,7 +18,7 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.core.errors import UsageError
 from airl_mav.core.ports import LOOPBACK
 from firmware_sim.external.ardupilot.program import PORTS_PER_INSTANCE, SIMULATOR_PORT
-from firmware_sim.external.bridge import no_process
+from firmware_sim.external.launcher import no_process
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
 from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth
 from firmware_sim.mavlink.endpoint import Address
@@ -35,7 +35,7 @@ class ServoPacketError(ValueError):
 
 
 class ServoPacket(NamedTuple):
-    """What ArduPilot sends once per frame."""
+    """Packet of ArduPilot for each frame."""
 
     frame_rate_hz: int
     """Frames a second of simulated time that it asks for (SIM_RATE_HZ)."""
@@ -106,7 +106,7 @@ MOTORS = 4
 
 
 class ArdupilotBridge:
-    """One ArduPilot, one episode. Implements `bridge.Bridge`."""
+    """One ArduPilot, one episode. Implements `Bridge`."""
 
     def __init__(self, port: int, *, silence_s: float = SILENCE_S) -> None:
         """Open a loopback UDP port, or raise UsageError; packets may take `silence_s` [wall s]."""

@@ -14,7 +14,7 @@ from contextlib import suppress
 
 from airl_mav.core.clock import WallClock
 from airl_mav.core.constants import TICK_HZ, US_PER_S
-from firmware_sim.external.bridge import no_process
+from firmware_sim.external.launcher import no_process
 from firmware_sim.external.px4 import hil_messages as hil
 from firmware_sim.external.px4.board_link import BoardLink
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError

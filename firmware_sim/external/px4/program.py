@@ -26,8 +26,8 @@ MODEL = "none_iris"
 SCRIPT = "etc/init.d-posix/rcS"
 
 UNAWAITED_THREADS = (b"commander", b"navigator", b"mavlink_if1", b"mavlink_if2")
-"""Threads that PX4 does not wait for before it answers a sample, and that a flight depends on:
-modules with a thread of their own, and the links of companion and observer (px4-rc.mavlink starts
+"""Threads that PX4 does not wait for before it answers a sample, and that a flight depends on.
+Modules with a thread of their own, and the links of companion and observer (px4-rc.mavlink starts
 0 for the ground station, 1 onboard, 2 for a payload, 3 for a gimbal). Its controllers and estimator
 run in work queues, which it waits for."""
 

@@ -5,21 +5,157 @@ Source: PX4, src/modules/simulation/simulator_mavlink; the order of messages as 
 
 from __future__ import annotations
 
+import errno
 import math
+import select
+import socket
 import sys
 from collections.abc import Callable
+from typing import Any
 
 from airl_mav.core.clock import Patience, WallClock
-from airl_mav.core.constants import TICK_HZ, TICK_US, US_PER_S
-from firmware_sim.external.bridge import no_process
+from airl_mav.core.constants import MS_PER_S, TICK_HZ, TICK_US, US_PER_S
+from airl_mav.core.errors import UsageError
+from airl_mav.core.ports import LOOPBACK
+from firmware_sim.external.launcher import no_process
 from firmware_sim.external.process import RunningProgram, program_at
 from firmware_sim.external.px4 import hil_messages as hil
 from firmware_sim.external.px4.program import MODEL, SIMULATOR_PORT, UNAWAITED_THREADS
-from firmware_sim.external.transport.tcp_port import WATCH_S, TcpPort
 from firmware_sim.flight_controller import FirmwareLostError, FirmwareMissingError
 from firmware_sim.interfaces import ActuatorControls, SensorSample, Truth
-from firmware_sim.mavlink.codec import Decoder, Encoder, WireMessage, dialect
-from firmware_sim.mavlink.streams.ground_truth import hil_state_quaternion
+from firmware_sim.mavlink.codec import Decoder, Encoder, Layout, Values, WireMessage, dialect
+from firmware_sim.mavlink.streams.pose import hil_state_quaternion
+
+WATCH_S = 0.1
+"""Longest wait without checking that the other program is alive [wall s]."""
+
+CHUNK = 65_536
+
+_READ, _WRITE = select.POLLIN, select.POLLOUT
+
+
+class TcpPort:
+    """Listens on the loopback address, accepts one connection, refuses every further one."""
+
+    def __init__(self, port: int) -> None:
+        """Listen on a TCP port, 0 = any free one. Raises UsageError if it cannot be used."""
+        self.refused = 0
+        """Further connections that were refused."""
+        self._clock = WallClock()
+        self._connection: socket.socket | None = None
+        self._listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        self._listener.setblocking(False)
+        try:
+            self._listener.bind((LOOPBACK, port))
+            self._listener.listen()
+        except (OSError, OverflowError) as error:
+            self._listener.close()
+            raise UsageError(_listen_problem(port, error)) from error
+        self.port: int = self._listener.getsockname()[1]
+        self._poll = select.poll()
+        self._poll.register(self._listener, _READ)
+
+    def accept(self, timeout_s: float, alive: Callable[[], None]) -> bool:
+        """Wait for the connection [wall s]; return whether it was made; `alive` may raise."""
+        deadline_us = self._deadline_us(timeout_s)
+        while self._connection is None:
+            alive()
+            left_s = self._left_s(deadline_us)
+            if left_s <= 0.0:
+                return False
+            if self._poll.poll(min(left_s, WATCH_S) * MS_PER_S):
+                self._connection = self._newcomer()
+        self._connection.setblocking(False)
+        self._connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._poll.register(self._connection, _READ)
+        return True
+
+    @property
+    def peer(self) -> tuple[str, int]:
+        """Address of the other end."""
+        host, port = self._connected().getpeername()
+        return host, port
+
+    def send(self, data: bytes, timeout_s: float, alive: Callable[[], None]) -> bool:
+        """Send all of it; False when the connection has ended or does not accept it in time."""
+        connection, left = self._connected(), data
+        sent = _send(connection, left)
+        if sent == len(left):
+            return True  # As nearly always: there is nothing to look at the clock for.
+        deadline_us = self._deadline_us(timeout_s)
+        while sent is not None:
+            left = left[sent:]
+            left_s = self._left_s(deadline_us)
+            if not left or left_s <= 0.0:
+                return not left
+            alive()
+            writable = select.poll()
+            writable.register(connection, _WRITE)
+            writable.poll(min(left_s, WATCH_S) * MS_PER_S)
+            sent = _send(connection, left)
+        return False
+
+    def receive(self, timeout_s: float) -> bytes | None:
+        """Return received data, b"" after a timeout [wall s] or early, None at the end."""
+        connection = self._connected()
+        for number, _ in self._poll.poll(timeout_s * MS_PER_S):
+            if number == connection.fileno():
+                try:
+                    return connection.recv(CHUNK) or None
+                except BlockingIOError:
+                    return b""
+                except OSError:
+                    return None
+            newcomer = self._newcomer()
+            if newcomer is not None:
+                newcomer.close()
+                self.refused += 1
+        return b""
+
+    def close(self) -> None:
+        """Close everything; harmless when called again."""
+        if self._connection is not None:
+            self._connection.close()
+        self._listener.close()
+
+    def _connected(self) -> socket.socket:
+        if self._connection is None:
+            raise RuntimeError("there is no connection yet")
+        return self._connection
+
+    def _newcomer(self) -> socket.socket | None:
+        """Return who asked to be connected; None when it is gone again."""
+        try:
+            return self._listener.accept()[0]
+        except OSError:
+            return None
+
+    def _deadline_us(self, timeout_s: float) -> int:
+        return self._clock.time_us() + int(timeout_s * US_PER_S)
+
+    def _left_s(self, deadline_us: int) -> float:
+        return (deadline_us - self._clock.time_us()) / US_PER_S
+
+
+def _send(connection: socket.socket, data: bytes) -> int | None:
+    """Return how many bytes were taken, None when the connection has ended."""
+    try:
+        return connection.send(data)
+    except BlockingIOError:
+        return 0
+    except OSError:
+        return None
+
+
+def _listen_problem(port: int, error: OSError | OverflowError) -> str:
+    where = f"TCP port {port} on {LOOPBACK}"
+    if isinstance(error, OverflowError):
+        return f"--instance: {where}: must be in 0..65535"
+    if error.errno == errno.EADDRINUSE:
+        return f"{where} is taken (another simulator?): choose another with --instance"
+    return f"{where} cannot be used ({error.strerror}): choose another with --instance"
+
 
 ANSWER_S = 5.0
 """Longest wait for an answer [wall s]."""
@@ -52,6 +188,14 @@ MAX_GARBAGE = 16
 
 MAX_GARBAGE_BYTES = 4096
 """Longest run of it."""
+
+_BESIDE_THE_SAMPLE: tuple[tuple[str, Layout, Callable[[Any, int], Values]], ...] = (
+    ("gps", hil.GPS, hil.gps),
+    ("odometry", hil.ODOMETRY, hil.odometry),
+    ("distance", hil.DISTANCE, hil.distance),
+    ("flow", hil.FLOW, hil.flow),
+)
+"""Messages of a sample's slower sensors, in the order in which they are sent."""
 
 _ANSWER = dialect.MAVLINK_MSG_ID_HIL_ACTUATOR_CONTROLS
 _COMMAND = dialect.MAVLINK_MSG_ID_COMMAND_LONG
@@ -188,17 +332,10 @@ class Px4Bridge:
         encoder = self._encoder
         # What comes with a sample goes before it: the sample moves PX4's clock, and is answered.
         data = b""
-        if sample.gps is not None:
-            data += encoder.frame(hil.GPS, hil.GPS.payload(hil.gps(sample.gps, now_us)))
-        if sample.odometry is not None:
-            seen = hil.odometry(sample.odometry, now_us)
-            data += encoder.frame(hil.ODOMETRY, hil.ODOMETRY.payload(seen))
-        if sample.distance is not None:
-            told = hil.distance(sample.distance, now_us)
-            data += encoder.frame(hil.DISTANCE, hil.DISTANCE.payload(told))
-        if sample.flow is not None:
-            seen_below = hil.flow(sample.flow, now_us)
-            data += encoder.frame(hil.FLOW, hil.FLOW.payload(seen_below))
+        for name, kind, fields in _BESIDE_THE_SAMPLE:
+            measured = getattr(sample, name)
+            if measured is not None:
+                data += encoder.frame(kind, kind.payload(fields(measured, now_us)))
         if now_us >= self._state_due_us and self._truth is not None:
             # Keeps its phase, skips what it missed.
             late_us = now_us - self._state_due_us

@@ -97,19 +97,15 @@ class Line(Protocol):
 
     def read(self) -> bytes:
         """Return what has arrived."""
-        ...
 
     def write(self, data: bytes) -> bool:
         """Send soon; False when dropped."""
-        ...
 
     def drain(self) -> None:
         """Send what is queued."""
-        ...
 
     def fileno(self) -> int:
         """Return the descriptor to wait on."""
-        ...
 
 
 class _Client:

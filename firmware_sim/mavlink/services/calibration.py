@@ -1,8 +1,8 @@
 """Sensor calibration, as a PX4 SITL goes through it: texts that ground stations follow.
 
 The simulated sensors are calibrated from the start, so nothing is estimated. What is real is what a
-client sees. A calibration is refused while the vehicle is armed or another one runs, it fails when
-the vehicle moves, it takes its time, and one that needs the vehicle turned by hand waits until it
+client sees. A calibration is refused while the vehicle is armed or another one runs. It fails when
+the vehicle moves, and it takes its time. One that needs the vehicle turned by hand waits until it
 is cancelled. Source: PX4 1.16, Commander::handle_command and what a running SITL said.
 """
 

@@ -4,6 +4,10 @@ Answers and refusals follow PX4's Commander.cpp and mavlink_receiver.cpp, checke
 running PX4 1.16. A command addressed to the vehicle is acknowledged to its sender, on the link it
 came from. The same command may come twice (clients repeat), so actions are idempotent. A service
 with commands has a table `ACTIONS` of its own, which is taken into the one here.
+
+MAV_CMD_INJECT_FAILURE makes a part fail: the simulated part itself, as in a scenario. Which units
+and types are known, and which get no answer at all, is PX4's (SimulatorMavlink, FailureInjector,
+BatterySimulator; 1.16).
 """
 
 from __future__ import annotations
@@ -11,18 +15,18 @@ from __future__ import annotations
 import math
 from operator import attrgetter
 
-from firmware_sim.autopilot.autopilot_state import Message, Mode, Result, Severity
+from airl_mav.faults.kinds import MOTORS, Part
+from airl_mav.faults.model import Fault
+from firmware_sim.autopilot.autopilot_state import Arming, Message, Mode, Result, Severity
 from firmware_sim.autopilot.events import command_events as events
 from firmware_sim.mavlink.codec import WireMessage, dialect
 from firmware_sim.mavlink.px4_custom_mode import requested_mode
 from firmware_sim.mavlink.services import (
     calibration,
-    failure,
     logs,
     message_requests,
     navigation_commands,
     params,
-    without_effect,
 )
 from firmware_sim.mavlink.services.context import (
     ANY,
@@ -33,8 +37,118 @@ from firmware_sim.mavlink.services.context import (
     sender,
 )
 from firmware_sim.mavlink.services.navigation_commands import local_place
-from firmware_sim.mavlink.streams.flight_modes import KNOWN
+from firmware_sim.mavlink.streams.information import KNOWN
 from firmware_sim.mavlink.streams.units import INT32_MAX
+
+ENABLED = "SYS_FAILURE_EN"
+
+OK, OFF = dialect.FAILURE_TYPE_OK, dialect.FAILURE_TYPE_OFF
+STUCK, WRONG = dialect.FAILURE_TYPE_STUCK, dialect.FAILURE_TYPE_WRONG
+
+SENSORS: dict[int, tuple[Part | None, tuple[int, ...]]] = {
+    dialect.FAILURE_UNIT_SENSOR_GYRO: ("gyro", (OK, OFF, STUCK)),
+    dialect.FAILURE_UNIT_SENSOR_ACCEL: ("accel", (OK, OFF, STUCK)),
+    dialect.FAILURE_UNIT_SENSOR_MAG: ("mag", (OK, OFF, STUCK)),
+    dialect.FAILURE_UNIT_SENSOR_BARO: ("baro", (OK, OFF, STUCK)),
+    dialect.FAILURE_UNIT_SENSOR_GPS: ("gps", (OK, OFF)),
+    dialect.FAILURE_UNIT_SENSOR_VIO: ("vision", (OK, OFF)),
+    # The vehicle has none; PX4 takes the command all the same.
+    dialect.FAILURE_UNIT_SENSOR_AIRSPEED: (None, (OK, OFF, WRONG)),
+}
+"""Part and accepted types of each sensor; other types are UNSUPPORTED."""
+
+WITHOUT_INSTANCE: tuple[Part, ...] = ("baro", "gps", "vision")
+"""Sensors of which PX4 has one, whatever instance is named."""
+
+KINDS = {OFF: "off", STUCK: "stuck"}
+
+GREATEST_MOTOR = 8
+"""ESCs that PX4 counts."""
+
+
+def _inject(command: Command, context: Context) -> Result | None:
+    """Parameters: unit, type, instance (0: all)."""
+    enabled = context.port.parameters.by_name(ENABLED)
+    if enabled is None or not enabled.value:
+        return Result.DENIED
+    unit, kind, instance = command.integer(1), command.integer(2), command.integer(3) or 0
+    if unit is None or kind is None:
+        return None
+    if unit in SENSORS:
+        part, known = SENSORS[unit]
+        if kind not in known:
+            return Result.UNSUPPORTED
+        meant = part is not None and (part in WITHOUT_INSTANCE or instance in (0, 1))
+        _act(context, (part,) if part is not None and meant else (), kind)
+        return Result.ACCEPTED
+    if unit == dialect.FAILURE_UNIT_SYSTEM_BATTERY and kind in (OK, OFF):
+        if instance:
+            return Result.UNSUPPORTED
+        _act(context, ("battery",), kind)
+        return Result.ACCEPTED
+    if unit == dialect.FAILURE_UNIT_SYSTEM_MOTOR:
+        return _motor(context, kind, instance)
+    return None  # nobody in PX4 answers
+
+
+def _motor(context: Context, kind: int, instance: int) -> Result:
+    if kind not in (OK, OFF, WRONG) or (kind == OK and not 0 <= instance <= GREATEST_MOTOR):
+        return Result.UNSUPPORTED
+    if kind != WRONG:  # its readings alone would be wrong
+        motors = MOTORS if instance == 0 else MOTORS[instance - 1 : instance]
+        _act(context, motors if instance >= 0 else (), kind)
+    return Result.ACCEPTED
+
+
+def _act(context: Context, parts: tuple[Part, ...], kind: int) -> None:
+    failures = context.port.failures
+    if failures is None:
+        return
+    for part in parts:
+        failures.clear(part)
+        if kind != OK:
+            failures.inject(Fault(part=part, kind=KINDS[kind]))
+
+
+# Commands that do nothing here are answered as a running PX4 1.16 SITL answers them.
+
+ACCEPTED = (
+    dialect.MAV_CMD_DO_SET_ACTUATOR,
+    dialect.MAV_CMD_DO_GO_AROUND,
+    dialect.MAV_CMD_EXTERNAL_WIND_ESTIMATE,
+)
+
+NOT_ACKNOWLEDGED = [
+    int(getattr(dialect, f"MAV_CMD_{name}"))
+    for name in (
+        *("CONFIGURE_ACTUATOR", "DO_FIGURE_EIGHT", "DO_SET_CAM_TRIGG_DIST"),
+        *("DO_SET_CAM_TRIGG_INTERVAL", "OBLIQUE_SURVEY", "SET_CAMERA_ZOOM"),
+        *("SET_CAMERA_FOCUS", "START_RX_PAIR", "SET_CAMERA_MODE", "DO_DIGICAM_CONTROL"),
+        *("DO_TRIGGER_CONTROL", "DO_GRIPPER", "DO_WINCH", "DO_MOUNT_CONTROL"),
+        *("DO_MOUNT_CONFIGURE", "DO_MOUNT_CONTROL_QUAT", "DO_GIMBAL_MANAGER_PITCHYAW"),
+        *("DO_GIMBAL_MANAGER_CONFIGURE", "REQUEST_CAMERA_INFORMATION", "NAV_DELAY"),
+        *("DO_VTOL_TRANSITION", "PREFLIGHT_SET_SENSOR_OFFSETS", "PREFLIGHT_UAVCAN"),
+        *("PAYLOAD_PREPARE_DEPLOY", "PAYLOAD_CONTROL_DEPLOY"),
+    )
+]
+"""Commands to a part of the vehicle that is not there."""
+
+
+def _answer(result: Result | None) -> Action:
+    """Return the action that does nothing and answers so."""
+    return lambda _command, _context: result
+
+
+def _actuator_test(_command: Command, context: Context) -> Result | None:
+    """PX4 refuses it while armed; disarmed there is nothing here that could be turned."""
+    armed = context.port.state().status.arming is Arming.ARMED
+    return Result.DENIED if armed else None
+
+
+def _high_latency(_command: Command, context: Context) -> Result:
+    context.announce(Message.of(Severity.CRITICAL, events.NO_HIGH_LATENCY))
+    return Result.FAILED
+
 
 FORCE_MAGIC = 21_196
 """MAV_CMD_COMPONENT_ARM_DISARM param2 that skips the checks."""
@@ -145,13 +259,18 @@ ACTIONS: dict[int, Action] = {
     dialect.MAV_CMD_DO_FLIGHTTERMINATION: _terminate,
     dialect.MAV_CMD_RUN_PREARM_CHECKS: _run_checks,
     dialect.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: _reboot,
-    **failure.ACTIONS,
+    dialect.MAV_CMD_INJECT_FAILURE: _inject,
     **logs.ACTIONS,
     **message_requests.ACTIONS,
     **calibration.ACTIONS,
     **navigation_commands.ACTIONS,
     **params.ACTIONS,
-    **without_effect.ACTIONS,
+    **dict.fromkeys(ACCEPTED, _answer(Result.ACCEPTED)),
+    **dict.fromkeys(NOT_ACKNOWLEDGED, _answer(None)),
+    dialect.MAV_CMD_ACTUATOR_TEST: _actuator_test,
+    dialect.MAV_CMD_CONTROL_HIGH_LATENCY: _high_latency,
+    # The estimator takes a place from outside only while it has none of its own.
+    dialect.MAV_CMD_EXTERNAL_POSITION_ESTIMATE: _answer(Result.TEMPORARILY_REJECTED),
 }
 """Everything else is UNSUPPORTED."""
 

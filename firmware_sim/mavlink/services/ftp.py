@@ -8,16 +8,17 @@ from __future__ import annotations
 
 import errno
 import struct
-from typing import NamedTuple
 
 from airl_mav.core.constants import US_PER_S
 from firmware_sim.mavlink.codec import WireMessage
 from firmware_sim.mavlink.services import component_metadata
 from firmware_sim.mavlink.services.context import Context, sender
-from firmware_sim.mavlink.services.ftp_files import DATA_BYTES, OPERATIONS, Checksum, read_at
+from firmware_sim.mavlink.services.ftp_files import DATA_BYTES, OPERATIONS, read_at
 from firmware_sim.mavlink.services.transfers import (
     SESSION,
+    Answered,
     Burst,
+    Checksum,
     Code,
     RefusedError,
     Request,
@@ -53,7 +54,7 @@ def handle_request(message: WireMessage, context: Context) -> bool:
     if sequence == client.last_sequence:
         _send(client.last_answer, asker, context)
         return True
-    if client.summing is not None and client.summing.sequence == sequence:
+    if client.summing is not None and client.summing.asked.sequence == sequence:
         return True  # asked again, out of impatience
     client.stop_summing()
     if client.session.file is not None and context.now_us - client.used_us > _IDLE_US:
@@ -61,6 +62,7 @@ def handle_request(message: WireMessage, context: Context) -> bool:
     client.used_us = context.now_us
     data = payload[_HEADER.size :][: min(size, DATA_BYTES)]
     request = Request(session, opcode, offset, size, data)
+    asked = Answered(sequence, session, opcode, offset, asker)
     try:
         if size > DATA_BYTES:
             raise RefusedError(Code.INVALID_DATA_SIZE)
@@ -72,7 +74,7 @@ def handle_request(message: WireMessage, context: Context) -> bool:
             component_metadata.provide(context.storage)
             checksum = Checksum(context.storage.path(request.name))
             client.burst = None
-            client.summing = Summing(sequence, session, offset, asker, checksum)
+            client.summing = Summing(asked, checksum)
             _sum(client.summing, context)
             return True
         answer = _carried_out(request, context)
@@ -80,18 +82,8 @@ def handle_request(message: WireMessage, context: Context) -> bool:
     except (RefusedError, OSError) as error:
         answer, kind = _error(error), _NAK
     client.burst = None
-    _answer(Answered(sequence, session, opcode, offset, asker), kind, answer, context)
+    _answer(asked, kind, answer, context)
     return True
-
-
-class Answered(NamedTuple):
-    """Fields of an answer about its request."""
-
-    sequence: int
-    session: int
-    opcode: int
-    offset: int
-    asker: tuple[int, int]
 
 
 def _answer(request: Answered, kind: int, answer: bytes, context: Context) -> None:
@@ -115,8 +107,7 @@ def _sum(summing: Summing, context: Context) -> None:
         answer, kind = _error(error), _NAK
     if answer is not None:
         context.ftp.stop_summing()
-        asked = Answered(summing.sequence, summing.session, _CRC32, summing.offset, summing.asker)
-        _answer(asked, kind, answer, context)
+        _answer(summing.asked, kind, answer, context)
 
 
 def send_pending(context: Context) -> None:

@@ -13,8 +13,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO
 
-from firmware_sim.mavlink.crc32 import crc32part
-from firmware_sim.mavlink.services.transfers import Code, RefusedError, Request, Session
+from firmware_sim.mavlink.services.transfers import (
+    CHUNK_BYTES,
+    Code,
+    RefusedError,
+    Request,
+    Session,
+)
 from firmware_sim.storage import Storage
 
 DATA_BYTES = 239
@@ -23,7 +28,6 @@ DATA_BYTES = 239
 READ_ONLY = "etc"
 """Folder of the vehicle's own files: clients may read it."""
 
-_CHUNK_BYTES = 1 << 16
 _SIZE = struct.Struct("<I")
 
 
@@ -106,7 +110,7 @@ def _write(request: Request, session: Session, storage: Storage) -> bytes:
     file = session.opened(request)
     end = request.offset + len(request.data)
     if end > session.size:
-        if end // _CHUNK_BYTES != session.size // _CHUNK_BYTES:
+        if end // CHUNK_BYTES != session.size // CHUNK_BYTES:
             storage.check_room(end - session.size)
         session.size = end
     file.seek(request.offset)
@@ -154,27 +158,6 @@ def _rename(request: Request, _session: Session, storage: Storage) -> bytes:
     source = _writable(os.fsdecode(old), storage)
     source.rename(_writable(os.fsdecode(new), storage))
     return b""
-
-
-class Checksum:
-    """The CRC-32 of a file, piece by piece: a large file takes longer than a tick."""
-
-    def __init__(self, path: Path) -> None:
-        """Open the file. Raises OSError."""
-        self._crc = 0
-        self._file = path.open("rb", buffering=0)
-
-    def go_on(self) -> bytes | None:
-        """Read the next piece; return the data of the answer after the last. Raises OSError."""
-        chunk = self._file.read(_CHUNK_BYTES)
-        self._crc = crc32part(chunk, self._crc)
-        if len(chunk) == _CHUNK_BYTES:
-            return None
-        return _SIZE.pack(self._crc)
-
-    def close(self) -> None:
-        """Close the file; harmless when called again."""
-        self._file.close()
 
 
 def _nothing(_request: Request, _session: Session, _storage: Storage) -> bytes:

@@ -18,7 +18,7 @@ from firmware_sim.mavlink.event_buffer import KEPT, NUMBERS, message
 from firmware_sim.mavlink.scheduler import OFF
 from firmware_sim.mavlink.services import component_metadata
 from firmware_sim.mavlink.services.context import Action, Command, Context
-from firmware_sim.mavlink.streams import flight_modes
+from firmware_sim.mavlink.streams import information
 from firmware_sim.mavlink.streams.units import INT32_MAX, boot_ms
 
 _INTERVAL_UNAVAILABLE = 0
@@ -93,7 +93,7 @@ def _request_interval(command: Command, context: Context) -> Result:
 def _request_modes(command: Command, context: Context) -> Result:
     """Parameter 2: the mode's number from 1 on; 0 = all."""
     asked = command.integer(2) or 0
-    modes = flight_modes.available_modes()
+    modes = information.available_modes()
     if not 0 <= asked <= len(modes):
         return Result.DENIED
     for fields in modes if asked == 0 else modes[asked - 1 : asked]:

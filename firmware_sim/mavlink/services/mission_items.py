@@ -8,12 +8,18 @@ from __future__ import annotations
 
 import math
 import struct
-import zlib
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 
-from firmware_sim.autopilot.navigation.plan import Frame, Kind, NavCommand, PlanItem
+from firmware_sim.autopilot.navigation.plan import (
+    NOT_IN_MISSIONS,
+    Frame,
+    Kind,
+    NavCommand,
+    PlanItem,
+)
 from firmware_sim.mavlink.codec import WireMessage, dialect
+from firmware_sim.mavlink.services.transfers import crc32part
 
 _N = NavCommand
 
@@ -79,54 +85,9 @@ _PLACES: Mapping[int, tuple[_Kept, _Kept, _Kept, _Kept]] = MappingProxyType(
 )
 """Commands with a place, and what a download returns of their parameters 1..4."""
 
-_WITHOUT_PLACE = frozenset(
-    {
-        _N.RETURN_TO_LAUNCH,
-        _N.ROI,
-        _N.DELAY,
-        _N.CONDITION_DELAY,
-        _N.CONDITION_DISTANCE,
-        _N.DO_JUMP,
-        _N.DO_CHANGE_SPEED,
-        _N.DO_SET_HOME,
-        _N.DO_SET_ACTUATOR,
-        _N.DO_LAND_START,
-        _N.DO_SET_ROI,
-        _N.DO_SET_ROI_WPNEXT_OFFSET,
-        _N.DO_SET_ROI_NONE,
-        _N.DO_CONTROL_VIDEO,
-        _N.DO_DIGICAM_CONTROL,
-        _N.DO_MOUNT_CONFIGURE,
-        _N.DO_MOUNT_CONTROL,
-        _N.DO_SET_CAM_TRIGG_DIST,
-        _N.DO_SET_CAM_TRIGG_INTERVAL,
-        _N.OBLIQUE_SURVEY,
-        _N.DO_GRIPPER,
-        _N.DO_WINCH,
-        _N.SET_CAMERA_MODE,
-        _N.SET_CAMERA_FOCUS,
-        _N.SET_CAMERA_SOURCE,
-        _N.DO_GIMBAL_MANAGER_PITCHYAW,
-        _N.DO_GIMBAL_MANAGER_CONFIGURE,
-        _N.IMAGE_START_CAPTURE,
-        _N.IMAGE_STOP_CAPTURE,
-        _N.DO_TRIGGER_CONTROL,
-        _N.VIDEO_START_CAPTURE,
-        _N.VIDEO_STOP_CAPTURE,
-        _N.DO_VTOL_TRANSITION,
-    }
-)
+_WITHOUT_PLACE = frozenset(_N) - _PLACES.keys() - {_N.SET_CAMERA_ZOOM} | {_N.ROI, _N.DO_SET_ROI}
 """Commands of the frame MISSION."""
 
-_NOT_IN_MISSIONS = frozenset(
-    {
-        _N.FENCE_POLYGON_VERTEX_INCLUSION,
-        _N.FENCE_POLYGON_VERTEX_EXCLUSION,
-        _N.FENCE_CIRCLE_INCLUSION,
-        _N.FENCE_CIRCLE_EXCLUSION,
-        _N.RALLY_POINT,
-    }
-)
 _POLYGONS = (_N.FENCE_POLYGON_VERTEX_INCLUSION, _N.FENCE_POLYGON_VERTEX_EXCLUSION)
 
 _CHECKED = struct.Struct("<BHB4f4s4sf")
@@ -170,7 +131,7 @@ def parse(message: WireMessage) -> PlanItem | int:
 def belongs(item: PlanItem, kind: Kind) -> bool:
     """Return whether an item may be part of such a list. A polygon has at least 3 vertices."""
     if kind is Kind.MISSION:
-        return item.command not in _NOT_IN_MISSIONS
+        return item.command not in NOT_IN_MISSIONS
     if kind is Kind.FENCE and item.command in _POLYGONS:
         return _rounded(item.params[0]) >= 3
     return True
@@ -207,19 +168,8 @@ def format_item(
         if integer
         else dialect.MAVLink_mission_item_message
     )
-    return build(
-        *target,
-        index,
-        frame,
-        item.command,
-        int(current),
-        int(item.autocontinue),
-        *params,
-        x,
-        y,
-        item.z,
-        int(kind),
-    )
+    flags = int(current), int(item.autocontinue)
+    return build(*target, index, frame, item.command, *flags, *params, x, y, item.z, int(kind))
 
 
 def _frame(*, relative: bool, integer: bool) -> int:
@@ -238,16 +188,7 @@ def _fit(value: float) -> int:
 def checksum(message: WireMessage, previous: int) -> int:
     """Return PX4's checksum of a list with one more item: its opaque id (CRC-32, no inversion)."""
     pack = struct.Struct("<i" if is_int(message) else "<f").pack
-    covered = _CHECKED.pack(
-        message.frame,
-        message.command,
-        message.autocontinue,
-        message.param1,
-        message.param2,
-        message.param3,
-        message.param4,
-        pack(message.x),
-        pack(message.y),
-        message.z,
-    )
-    return zlib.crc32(covered, previous ^ 0xFFFF_FFFF) ^ 0xFFFF_FFFF
+    four = (message.param1, message.param2, message.param3, message.param4)
+    head = (message.frame, message.command, message.autocontinue)
+    covered = _CHECKED.pack(*head, *four, pack(message.x), pack(message.y), message.z)
+    return crc32part(covered, previous)

@@ -9,7 +9,7 @@ https://mavlink.io/en/services/mission.html
 from __future__ import annotations
 
 from firmware_sim.autopilot.autopilot_state import Message, Severity
-from firmware_sim.autopilot.events import mission_events as events
+from firmware_sim.autopilot.events import flight_events as events
 from firmware_sim.autopilot.events.definition import Definition
 from firmware_sim.autopilot.navigation.plan import MOST_ITEMS, Kind
 from firmware_sim.mavlink.codec import COMPONENT_ID, WireMessage, dialect

@@ -9,8 +9,8 @@ import struct
 from firmware_sim.autopilot.autopilot_state import Arming, Result
 from firmware_sim.autopilot.port import ParameterStore, ParameterValue
 from firmware_sim.mavlink.codec import WireMessage, dialect, param_value, payload
-from firmware_sim.mavlink.crc32 import crc32part
 from firmware_sim.mavlink.services.context import Action, Command, Context, sender
+from firmware_sim.mavlink.services.transfers import crc32part
 
 HASH_NAME = "_HASH_CHECK"
 """Pseudo parameter: a checksum by which a ground station recognises its cached values."""
@@ -125,12 +125,10 @@ def _hash_message(store: ParameterStore) -> tuple[str, bytes]:
 
 @functools.lru_cache(maxsize=1)
 def _hash_of(store: ParameterStore, _revision: int) -> int:
-    """Return `parameter_hash`, which takes most of a tick, once for all clients that begin."""
-    return parameter_hash(store)
+    """Return PX4's param_hash_check(): CRC-32 without inversions over all names and values.
 
-
-def parameter_hash(store: ParameterStore) -> int:
-    """Return PX4's param_hash_check(): CRC-32 without inversions over all names and values."""
+    It takes most of a tick. All clients that begin get the same.
+    """
     parameters = filter(None, map(store.by_index, range(len(store))))
     return crc32part(b"".join(p.name.encode("ascii") + _encoded(p.value) for p in parameters))
 

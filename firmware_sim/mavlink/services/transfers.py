@@ -3,17 +3,32 @@
 from __future__ import annotations
 
 import os
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from enum import Enum, IntEnum, auto
-from typing import BinaryIO, NamedTuple, Protocol
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
 
 from airl_mav.core.constants import US_PER_S
 from firmware_sim.autopilot.autopilot_state import Message
 from firmware_sim.autopilot.navigation.plan import PlanItem
 from firmware_sim.autopilot.port import LogEntry
 
+_ALL_ONES = 0xFFFF_FFFF
+
+
+def crc32part(data: bytes, crc: int = 0) -> int:
+    """Return the CRC-32 of what came before (`crc`) and of `data`.
+
+    zlib inverts before and after; PX4's crc32part() does not.
+    """
+    return zlib.crc32(data, crc ^ _ALL_ONES) ^ _ALL_ONES
+
+
 # --- MAVLink FTP
+
+CHUNK_BYTES = 1 << 16
 
 SESSION = 0
 """Number of a client's only session, as of PX4's."""
@@ -89,27 +104,43 @@ class Burst:
     asker: tuple[int, int]
 
 
-class Sum(Protocol):
-    """A checksum that is being worked out."""
+class Answered(NamedTuple):
+    """Fields of an answer about its request."""
+
+    sequence: int
+    session: int
+    opcode: int
+    offset: int
+    asker: tuple[int, int]
+
+
+class Checksum:
+    """The CRC-32 of a file, piece by piece: a large file takes longer than a tick."""
+
+    def __init__(self, path: Path) -> None:
+        """Open the file. Raises OSError."""
+        self._crc = 0
+        self._file = path.open("rb", buffering=0)
 
     def go_on(self) -> bytes | None:
-        """Return the data of the answer, None while it is not known. Raises OSError."""
-        ...
+        """Read the next piece; return the data of the answer after the last. Raises OSError."""
+        chunk = self._file.read(CHUNK_BYTES)
+        self._crc = crc32part(chunk, self._crc)
+        if len(chunk) == CHUNK_BYTES:
+            return None
+        return self._crc.to_bytes(4, "little")
 
     def close(self) -> None:
-        """Release what is held."""
-        ...
+        """Close the file; harmless when called again."""
+        self._file.close()
 
 
 @dataclass(slots=True)
 class Summing:
     """A request for a checksum that is not yet answered."""
 
-    sequence: int
-    session: int
-    offset: int
-    asker: tuple[int, int]
-    sum: Sum
+    asked: Answered
+    sum: Checksum
 
 
 @dataclass(slots=True)

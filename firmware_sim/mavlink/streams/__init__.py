@@ -11,41 +11,48 @@ from types import MappingProxyType
 
 from firmware_sim.autopilot.autopilot_state import AutopilotState
 from firmware_sim.mavlink.codec import Values
-from firmware_sim.mavlink.streams import (
-    actuators,
-    distance,
-    flight_modes,
-    gimbal,
-    high_latency,
-    information,
-    optical_flow,
-    pose,
-    sensors,
-    status,
-)
-from firmware_sim.mavlink.streams.silent import SILENT
+from firmware_sim.mavlink.streams import distance, information, pose, sensors, status
 
 Builder = Callable[[AutopilotState], "Values | None"]
 """Returns one message's fields, in the order of its definition, from a snapshot; None = there is
 nothing to say yet. Plain values, because message objects would cost more than all the rest."""
 
+_SILENT = (
+    *("GPS_STATUS", "NAV_CONTROLLER_OUTPUT", "COMMAND_LONG"),
+    *("CAMERA_TRIGGER", "SCALED_IMU2", "SCALED_IMU3", "GPS2_RAW"),
+    *("SCALED_PRESSURE3", "LANDING_TARGET", "EFI_STATUS", "WIND_COV"),
+    *("GPS_RTCM_DATA", "ADSB_VEHICLE", "DEBUG_VECT", "NAMED_VALUE_FLOAT"),
+    *("STATUSTEXT", "DEBUG", "CAMERA_IMAGE_CAPTURED", "MOUNT_ORIENTATION"),
+    *("GIMBAL_MANAGER_INFORMATION", "GIMBAL_MANAGER_STATUS", "GIMBAL_DEVICE_INFORMATION"),
+    *("GIMBAL_DEVICE_SET_ATTITUDE", "GIMBAL_DEVICE_ATTITUDE_STATUS"),
+    *("OBSTACLE_DISTANCE", "RAW_RPM", "DEBUG_FLOAT_ARRAY", "FIGURE_EIGHT_EXECUTION_STATUS"),
+    *("OPEN_DRONE_ID_BASIC_ID", "OPEN_DRONE_ID_LOCATION", "OPEN_DRONE_ID_SYSTEM"),
+)
+"""Streams of PX4's in which this vehicle has nothing to say: it lacks the device.
+
+A real PX4 accepts a rate for them and sends nothing, and so does this. Source: what a running PX4
+1.16 accepts in SET_MESSAGE_INTERVAL.
+"""
+
+
+def _nothing(state: AutopilotState) -> None:
+    """There is nothing to say."""
+
+
+SILENT: Mapping[str, Builder] = MappingProxyType(dict.fromkeys(_SILENT, _nothing))
+
+_PACKED = (
+    *("ATTITUDE", "ATTITUDE_QUATERNION", "LOCAL_POSITION_NED", "ODOMETRY"),
+    *("GLOBAL_POSITION_INT", "HIGHRES_IMU", "ALTITUDE", "ATTITUDE_TARGET"),
+    *("POSITION_TARGET_LOCAL_NED", "POSITION_TARGET_GLOBAL_INT"),
+    *("SERVO_OUTPUT_RAW", "VFR_HUD", "GPS_RAW_INT"),
+)
+
 BUILDERS: Mapping[str, Builder | None] = MappingProxyType(
     {
         **SILENT,
         "HEARTBEAT": status.heartbeat,
-        "ATTITUDE": None,
-        "ATTITUDE_QUATERNION": None,
-        "LOCAL_POSITION_NED": None,
-        "ODOMETRY": None,
-        "GLOBAL_POSITION_INT": None,
-        "HIGHRES_IMU": None,
-        "ALTITUDE": None,
-        "ATTITUDE_TARGET": None,
-        "POSITION_TARGET_LOCAL_NED": None,
-        "POSITION_TARGET_GLOBAL_INT": None,
-        "SERVO_OUTPUT_RAW": None,
-        "VFR_HUD": None,
-        "GPS_RAW_INT": None,
+        **dict.fromkeys(_PACKED),
         "EXTENDED_SYS_STATE": status.extended_sys_state,
         "SYS_STATUS": None,
         "ESTIMATOR_STATUS": status.estimator_status,
@@ -58,19 +65,19 @@ BUILDERS: Mapping[str, Builder | None] = MappingProxyType(
         "GPS_GLOBAL_ORIGIN": pose.gps_global_origin,
         "AUTOPILOT_VERSION": status.autopilot_version,
         "ORBIT_EXECUTION_STATUS": pose.orbit_execution_status,
-        "AUTOPILOT_STATE_FOR_GIMBAL_DEVICE": gimbal.autopilot_state_for_gimbal_device,
-        "CURRENT_MODE": flight_modes.current_mode,
+        "AUTOPILOT_STATE_FOR_GIMBAL_DEVICE": status.autopilot_state_for_gimbal_device,
+        "CURRENT_MODE": information.current_mode,
         "ESC_INFO": None,
         "ESC_STATUS": None,
-        "ACTUATOR_OUTPUT_STATUS": actuators.actuator_output_status,
-        "HIL_ACTUATOR_CONTROLS": actuators.hil_actuator_controls,
+        "ACTUATOR_OUTPUT_STATUS": sensors.actuator_output_status,
+        "HIL_ACTUATOR_CONTROLS": sensors.hil_actuator_controls,
         "SCALED_IMU": sensors.scaled_imu,
         "FLIGHT_INFORMATION": information.flight_information,
         "PROTOCOL_VERSION": information.protocol_version,
-        "HIGH_LATENCY2": high_latency.high_latency2,
+        "HIGH_LATENCY2": status.high_latency2,
         # Last, as it came last: where streams begin depends on their order.
         "DISTANCE_SENSOR": distance.distance_sensor,
-        "OPTICAL_FLOW_RAD": optical_flow.optical_flow_rad,
+        "OPTICAL_FLOW_RAD": distance.optical_flow_rad,
     }
 )
 """Streams that need the snapshot only; the server adds those that need more. None:

@@ -1,19 +1,20 @@
-"""What a distance sensor says, and how far the ground is below.
+"""Distance and optical flow sensors: height above the ground, and its motion.
 
-Source: PX4 1.16, streams/DISTANCE_SENSOR.hpp and ALTITUDE.hpp.
+Source: PX4 1.16, streams/DISTANCE_SENSOR.hpp, ALTITUDE.hpp and OPTICAL_FLOW_RAD.hpp.
 """
 
 from __future__ import annotations
 
 import math
 
+from airl_mav.core.constants import US_PER_S
 from firmware_sim.autopilot.autopilot_state import AutopilotState
 from firmware_sim.mavlink.codec import Values
 from firmware_sim.mavlink.streams import units
 
 NEW_US = 200_000
-"""PX4 sends a distance once. Here it is sent while it is not older than this, the longest time that
-its estimator waits for the next [µs]."""
+"""PX4 sends a measurement once. Here it is sent while it is not older than this, the longest time
+that its estimator waits for the next [µs]."""
 
 _CM, _CM2 = 1e2, 1e4
 _FIRST = 0
@@ -22,6 +23,7 @@ _LASER, _KINDS = 0, (0, 1, 2)
 _NO_FIELD_OF_VIEW = (0.0, 0.0)
 _NO_QUATERNION = (0.0, 0.0, 0.0, 0.0)
 _QUALITY_NOT_TOLD = 0
+_TEMPERATURE, _NO_DISTANCE_US, _NO_DISTANCE_M = 0, 0, -1.0
 
 
 def distance_sensor(state: AutopilotState) -> Values | None:
@@ -55,3 +57,21 @@ def clearance(state: AutopilotState, down: float) -> tuple[float, float]:
 def _whole(value: float) -> int:
     """Return what C makes of a number for a uint16 field: cut off, not rounded."""
     return units.uint16(math.floor(value + 1e-9), unknown=0)
+
+
+def optical_flow_rad(state: AutopilotState) -> Values | None:
+    """The newest flow and turn [rad]. Nothing where none comes."""
+    told = state.flow
+    if told is None or state.time_us - state.flow_us > NEW_US:
+        return None
+    return (
+        state.flow_us,
+        _FIRST,
+        round(told.interval_s * US_PER_S),
+        *told.flow.tolist(),
+        *told.turned.tolist(),
+        _TEMPERATURE,
+        told.quality,
+        _NO_DISTANCE_US,
+        _NO_DISTANCE_M,
+    )

@@ -1,13 +1,19 @@
-"""What the sensors and outputs say: IMU, pressure, GPS, battery, motors, vibration."""
+"""Sensors and outputs: IMU, pressure, GPS, battery, motors, vibration."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
-from airl_mav.core.constants import GRAVITY_M_S2
-from firmware_sim.autopilot.autopilot_state import AutopilotState
+import numpy as np
+
+from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S
+from airl_mav.core.kernels import kernel
+from firmware_sim.autopilot.autopilot_state import Arming, AutopilotState, Vector
 from firmware_sim.autopilot.port import ParameterStore
+from firmware_sim.engine.record import Record
 from firmware_sim.mavlink.codec import Values, dialect
+from firmware_sim.mavlink.px4_custom_mode import base_mode
 from firmware_sim.mavlink.streams import units
 
 _NO_AIRSPEED = 0.0
@@ -100,3 +106,112 @@ def _charge_state(remaining: float, parameters: ParameterStore) -> int:
 def percent(share: float) -> int:
     """Return a share 0..1 as percent for an int8 field, -1 when unknown."""
     return units.saturate(share * 100.0, 0, 100, -1)
+
+
+# --- outputs
+
+_PWM_DISARMED, _PWM_MIN, _PWM_SPAN = 900, 1_000, 1_000
+"""Pulse widths [µs] of PX4's simulated outputs (src/modules/simulation/pwm_out_sim)."""
+
+_OUTPUTS = 16
+"""Of PX4's simulation. Those that drive no motor stay at the disarmed pulse."""
+
+_OUTPUT_FIELDS = 32
+"""Slots of ACTUATOR_OUTPUT_STATUS."""
+
+
+def actuator_output_status(state: AutopilotState) -> Values:
+    """The same pulse widths as an array of 16 outputs in use."""
+    return state.time_us, _OUTPUTS, *_outputs(state), *(0,) * (_OUTPUT_FIELDS - _OUTPUTS)
+
+
+def hil_actuator_controls(state: AutopilotState) -> Values:
+    """Motor commands 0..1, zero while disarmed; 16 controls."""
+    commands, flags = _commands(state), 0
+    unused = (0.0,) * (_OUTPUTS - len(commands))
+    return state.time_us, *commands, *unused, base_mode(state.status), flags
+
+
+def _outputs(state: AutopilotState) -> Values:
+    """Return the pulse widths of all outputs [µs]."""
+    pulses = _pulses(state)
+    return *pulses, *(_PWM_DISARMED,) * (_OUTPUTS - len(pulses))
+
+
+def _armed(state: AutopilotState) -> bool:
+    return state.status.arming is Arming.ARMED
+
+
+def _commands(state: AutopilotState) -> tuple[float, ...]:
+    return state.motors if _armed(state) else (0.0,) * len(state.motors)
+
+
+def _pulses(state: AutopilotState) -> list[int]:
+    if not _armed(state):
+        return [_PWM_DISARMED] * len(state.motors)
+    return [_PWM_MIN + units.saturate(_PWM_SPAN * u, 0, _PWM_SPAN, 0) for u in state.motors]
+
+
+# --- vibration
+
+_OLD, _NEW = 0.99, 0.01
+"""Filter weights per sample (PX4 VehicleIMU::UpdateAccelVibrationMetrics)."""
+
+_CLIP_M_S2 = 16.0 * GRAVITY_M_S2
+"""Range of PX4's simulated accelerometer [m/s²]."""
+
+# What the meter remembers: the four metrics, and the last sample (time, gyro, accel).
+_CONING, _GYRO, _ACCEL, _CLIPPED, _LAST_US, _LAST_GYRO, _LAST_ACCEL, _SIZE = 0, 1, 2, 3, 4, 5, 8, 11
+
+
+class VibrationMeter:
+    """Filters every IMU sample; PX4's use of the fields differs from the MAVLink text.
+
+    vibration_x: coning, filtered |delta angle x previous delta angle| [rad²]. vibration_y:
+    filtered |gyro - previous gyro| [rad/s]. vibration_z: filtered |accel - previous accel|
+    [m/s²]. clipping_0: samples at the end of the accelerometer's range.
+    """
+
+    def __init__(self) -> None:
+        self._memory = np.zeros(_SIZE)
+        self._memory[_LAST_US] = math.nan
+
+    def update(self, flown: Record) -> None:
+        """Take in the samples of ticks (n,), each once (`engine.record.FLOWN_TICK`)."""
+        _update(self._memory, flown)
+
+    def message(self, state: AutopilotState) -> Values:
+        """Return VIBRATION. There is one accelerometer."""
+        coning, gyro, accel, clipped = self._memory[: _CLIPPED + 1].tolist()
+        clipping_1 = clipping_2 = 0
+        return state.time_us, coning, gyro, accel, int(clipped), clipping_1, clipping_2
+
+
+@kernel
+def _update(memory: Vector, flown: Record) -> None:
+    """Filter the samples of ticks (n,) into `memory` (11,)."""
+    for k in range(len(flown)):
+        _filter(memory, flown[k].time_us, flown[k].gyro, flown[k].accel)
+
+
+@kernel
+def _filter(memory: Vector, time_us: int, gyro: Vector, accel: Vector) -> None:
+    """Filter one sample into `memory` (11,); gyro (3,) FRD [rad/s], accel (3,) FRD [m/s²]."""
+    clipped = False
+    last_gyro, last_accel = memory[_LAST_GYRO:_LAST_ACCEL], memory[_LAST_ACCEL:_SIZE]
+    if not math.isnan(memory[_LAST_US]):
+        dt = (time_us - memory[_LAST_US]) / US_PER_S
+        cross, gyro_step, accel_step = 0.0, 0.0, 0.0
+        for i in range(3):
+            j, k = (i + 1) % 3, (i + 2) % 3
+            cross += (gyro[j] * last_gyro[k] - gyro[k] * last_gyro[j]) ** 2
+            gyro_step += (gyro[i] - last_gyro[i]) ** 2
+            accel_step += (accel[i] - last_accel[i]) ** 2
+        memory[_CONING] = _OLD * memory[_CONING] + _NEW * dt * dt * math.sqrt(cross)
+        memory[_GYRO] = _OLD * memory[_GYRO] + _NEW * math.sqrt(gyro_step)
+        memory[_ACCEL] = _OLD * memory[_ACCEL] + _NEW * math.sqrt(accel_step)
+    for i in range(3):
+        last_gyro[i], last_accel[i] = gyro[i], accel[i]
+        clipped = clipped or abs(accel[i]) >= _CLIP_M_S2
+    memory[_LAST_US] = time_us
+    memory[_CLIPPED] += clipped

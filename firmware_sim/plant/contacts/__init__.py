@@ -1,1 +1,1 @@
-"""What the vehicle's box touches, and what comes of it: the kernel plant's contacts."""
+"""Contacts of the vehicle's box in the kernel plant."""

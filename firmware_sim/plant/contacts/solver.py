@@ -1,7 +1,7 @@
 """Impulses that keep a body out of what it touches: Bullet's sequential impulses for one body.
 
 Rows, their order, the two directions of friction in one cone and the constants are those of
-btMultiBodyConstraintSolver as pybullet sets it up, so that a vehicle on the floor moves alike.
+btMultiBodyConstraintSolver as pybullet sets it up. A vehicle on the floor moves alike.
 """
 
 from __future__ import annotations
