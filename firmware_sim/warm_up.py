@@ -20,12 +20,15 @@ from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import VehicleProfile
 from airl_mav.scenario.aircraft import DEFAULT_PLANT, Aircraft, PlantName
+from firmware_sim.autopilot.climb import Climb
 from firmware_sim.autopilot.error_state import INITIAL_SIGMA, new_state
+from firmware_sim.autopilot.failsafes.watch import is_calm
 from firmware_sim.autopilot.filter_kernel import KernelFilter
 from firmware_sim.autopilot.range_finder import Aids, RangeFinder
 from firmware_sim.autopilot.terrain_filter import TerrainFilter
 from firmware_sim.autopilot.yaw_estimator import YawEstimator
 from firmware_sim.engine.controller import Controller
+from firmware_sim.engine.record import RISING
 from firmware_sim.engine.ticks import detect_record
 from firmware_sim.interfaces import DistanceReading
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
@@ -104,6 +107,8 @@ def _fly(vehicle: VehicleProfile, plant: PlantName, arena: Arena | None) -> None
     _fly_every_kind(autopilot.parameters.value)
     _fuse_in_the_air()
     detect_record(autopilot.record)
+    is_calm(autopilot.record, np.zeros(6))
+    Climb(autopilot.record).fly(RISING, 0)
     _measure_the_ground(autopilot.parameters.value)
 
 
