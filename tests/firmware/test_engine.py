@@ -25,6 +25,7 @@ from firmware_sim.mavlink.link import onboard_link
 from firmware_sim.mavlink.rates import ONBOARD_HZ
 from firmware_sim.mavlink.server import MavlinkServer
 from firmware_sim.mavlink.telemetry import FIELDS, NUMBERS
+from firmware_sim.plant.plant import Plant
 from firmware_sim.simulation import EpisodeSetup, Simulation
 
 STEP_US = 100_000
@@ -100,7 +101,7 @@ def test_python_flies_the_same_to_rounding(
     logs: tuple[Record, Record], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Ticks whose parts are called from Python, as where sensors fail or vision is fused."""
-    monkeypatch.setattr(Simulation, "_is_compiled", lambda *_: False)
+    monkeypatch.setattr(Plant, "compiled", False)
     with closing(new_simulation()) as simulation:
         truths, ticks = flown(simulation, tick_by_tick)
     np.testing.assert_allclose(truths["motion"], logs[0]["motion"], atol=1e-5)
