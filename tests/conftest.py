@@ -24,13 +24,8 @@ if find_spec("pybullet") is None:  # as on Python 3.12 and newer
     ]
     """They compare with pybullet."""
 
-RENDER_MESHES = {
-    "tests/firmware/test_ground_contacts.py",
-    "tests/learning/test_fleet_glass.py",
-    "tests/learning/test_fleet_meshes.py",
-    "tests/learning/test_fleet_terrain.py",
-}
-"""Modules for one worker: what they render with is compiled for half a minute, once."""
+RENDER_MESHES = {"tests/firmware/test_ground_contacts.py"}
+"""Modules for one worker, beside those of `one_renderer`: they need the same compiled kernels."""
 
 # The first call of a kernel on a fresh machine compiles it: seconds, not a slow example.
 settings.register_profile("kernels", deadline=None)
@@ -64,7 +59,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.flaky(reruns=1))
         if not group:
             module = item.nodeid.partition("::")[0]
-            name = "meshes" if module in RENDER_MESHES else module
+            rendered = "one_renderer" in getattr(item, "fixturenames", ())
+            name = "meshes" if rendered or module in RENDER_MESHES else module
             item.add_marker(pytest.mark.xdist_group(name))
     order = sorted(range(len(items)), key=lambda index: not named[index])
     items[:] = [items[index] for index in order]
@@ -98,6 +94,15 @@ def _one_worker_unless_asked() -> Iterator[None]:
     """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("airl_mav.experiments.process_executor.usable_cores", lambda: 1)
+        yield
+
+
+@pytest.fixture(scope="module")
+def one_renderer() -> Iterator[None]:
+    """Render everything in a module with the same compiled kernels."""
+    from tests.support.one_renderer import one_renderer as shared
+
+    with shared():
         yield
 
 
