@@ -5,13 +5,19 @@ from __future__ import annotations
 import gc
 import sys
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from functools import cache
 from importlib.util import find_spec
+from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import settings
 
 from tests.support.ports import reserved_instance
+
+if TYPE_CHECKING:
+    from airl_mav.experiments.executors import Executor
+    from airl_mav.scenario.model import Workers
 
 if find_spec("pybullet") is None:  # as on Python 3.12 and newer
     collect_ignore = [
@@ -24,13 +30,8 @@ if find_spec("pybullet") is None:  # as on Python 3.12 and newer
     ]
     """They compare with pybullet."""
 
-RENDER_MESHES = {
-    "tests/firmware/test_ground_contacts.py",
-    "tests/learning/test_fleet_glass.py",
-    "tests/learning/test_fleet_meshes.py",
-    "tests/learning/test_fleet_terrain.py",
-}
-"""Modules for one worker: what they render with is compiled for half a minute, once."""
+RENDER_MESHES = {"tests/firmware/test_ground_contacts.py"}
+"""Modules for one worker, beside those of `one_renderer`: they need the same compiled kernels."""
 
 # The first call of a kernel on a fresh machine compiles it: seconds, not a slow example.
 settings.register_profile("kernels", deadline=None)
@@ -64,7 +65,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.flaky(reruns=1))
         if not group:
             module = item.nodeid.partition("::")[0]
-            name = "meshes" if module in RENDER_MESHES else module
+            rendered = "one_renderer" in getattr(item, "fixturenames", ())
+            name = "meshes" if rendered or module in RENDER_MESHES else module
             item.add_marker(pytest.mark.xdist_group(name))
     order = sorted(range(len(items)), key=lambda index: not named[index])
     items[:] = [items[index] for index in order]
@@ -91,13 +93,31 @@ def _operators_are_read_once() -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def _one_worker_unless_asked() -> Iterator[None]:
-    """Let experiments in this process have one worker where a test asks for no number.
+    """Let experiments in this process have one worker, itself, where a test asks for no number.
 
-    Each is a process that imports all and loads the kernels, for seconds; the tests keep the cores
-    busy without them.
+    Another one is a process that imports all and loads the kernels, for seconds; the tests keep the
+    cores busy without them. That the flights are the same is the subject of
+    test_evaluate_lockstep.py.
     """
+    from airl_mav.experiments import experiment, fly
+    from airl_mav.experiments.process_executor import open_executor
+
+    def here(settings: Workers, *, in_process: bool = False) -> AbstractContextManager[Executor]:
+        return open_executor(settings, in_process=in_process or settings.workers is None)
+
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("airl_mav.experiments.process_executor.usable_cores", lambda: 1)
+        for module in (experiment, fly):
+            patch.setattr(module, "open_executor", here)
+        yield
+
+
+@pytest.fixture(scope="module")
+def one_renderer() -> Iterator[None]:
+    """Render everything in a module with the same compiled kernels."""
+    from tests.support.one_renderer import one_renderer as shared
+
+    with shared():
         yield
 
 

@@ -40,7 +40,14 @@ assert not new, new
 """
 
 
-@pytest.mark.parametrize("vehicle", ["quad", "quad-rgb", "quad-vio", "quad-indoor", "quad-flow"])
+# What quad-vio has, quad-indoor has as well.
+@pytest.mark.parametrize(
+    "vehicle",
+    [
+        *("quad", "quad-rgb", "quad-indoor", "quad-flow"),
+        pytest.param("quad-vio", marks=pytest.mark.nightly),
+    ],
+)
 def test_a_flight_asks_for_no_kernel_that_was_not_there_before(
     vehicle: str, tmp_path: Path
 ) -> None:

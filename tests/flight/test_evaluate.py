@@ -388,7 +388,7 @@ def test_a_page_alone_loads_what_draws(tmp_path: Path) -> None:
     program = """
 import sys
 from airl_mav.cli.options import carry_out
-words = ["--arena", "no-obstacles", "--episodes", "10", "--require", "success >= 50 %"]
+words = ["--arena", "no-obstacles", "--episodes", "4", "--require", "success >= 50 %"]
 assert carry_out("airl evaluate", "airl_mav.cli.evaluate", ["greedy", *words, "--out", "run"]) == 0
 known = {"matplotlib", "plotly", "jinja2", "scipy.stats", "scipy.optimize", "pybullet", "mavsdk"}
 known |= {"torch", "gymnasium"}
@@ -573,7 +573,10 @@ def test_what_is_finished_is_shown_again_and_not_flown(
     assert before == after
 
 
-def test_a_page_says_what_was_required_last(greedy: tuple[LoadedRun, str], tmp_path: Path) -> None:
+def test_a_page_says_what_was_required_last(
+    greedy: tuple[LoadedRun, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(shown_flights, "MAX_PICTURED", 0)
     shutil.copytree(greedy[0].path, tmp_path / "run")
     code, _ = evaluate("greedy", require="success >= 99 %", out=tmp_path / "run", **DENSE)
     assert code == 3

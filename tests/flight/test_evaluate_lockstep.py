@@ -65,9 +65,9 @@ def _few_pictures() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def reference(tmp_path_factory: pytest.TempPathFactory) -> tuple[LoadedRun, str]:
-    """One worker, undisturbed; and what was printed."""
+    """One worker, this process, undisturbed; and what was printed."""
     out = tmp_path_factory.mktemp("lockstep") / "one"
-    with page_alone():
+    with page_alone(), flown_here():
         code, text = evaluate("greedy", workers=1, out=out)
         write_report(out)
     assert code == 0

@@ -12,8 +12,12 @@ import torch
 
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.core.clock import WallClock
+from airl_mav.flight.judge import Outcome
+from airl_mav.lockstep.flight import fly
 from airl_mav.policy.action_sets import discrete_actions
 from airl_mav.policy.layouts import boxes
+from airl_mav.scenario.model import Scenario
+from airl_mav.scenario.resolve import resolve
 from airl_mav.training.export import load_module
 from airl_mav.training.export_request import ExportRequest
 from airl_mav.training.onnx_export import random_inputs
@@ -81,6 +85,13 @@ def test_gymnasium_px4(tmp_path: Path) -> None:
     np.testing.assert_allclose(built_in, in_twin, rtol=0.1)
 
 
+def test_the_policy_of_own_acceleration_reaches_its_goal() -> None:
+    policy = f"{EXAMPLES / 'own_acceleration.py'}:ToGoal"
+    asked = resolve(Scenario(policy=policy, arena="no-obstacles", level="lockstep"))
+    assert fly(asked, asked.fresh_policy(1), 0, 1).record.outcome is Outcome.SUCCESS
+
+
+@pytest.mark.nightly  # In every run its policy flies above.
 def test_own_acceleration(tmp_path: Path) -> None:
     text = output_of("own_acceleration.py", tmp_path)
     times_s = numbers_after(r"^seed \d: success after ([\d.]+) s$", text)

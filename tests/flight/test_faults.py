@@ -219,9 +219,24 @@ def test_killed_harness_leaves_nobody_behind(tmp_path: Path, ground: Ground) -> 
 # --- somebody presses Ctrl-C
 
 
+FEW_PICTURES = (
+    "-c",
+    """
+from airl_mav.cli import entry
+from airl_mav.report import shown_flights
+shown_flights.MAX_PICTURED = 0
+entry.sitl()
+""",
+    "--no-validity",
+)
+"""airl-sitl whose report has no picture of a single flight."""
+
+
 def test_interrupted_flight(tmp_path: Path, ground: Ground) -> None:
     ports = choose_ports(ground.port)
-    with sitl(tmp_path, ports, "--episodes", "3", goal_m=6.0, speed=4.0, program=SITL) as run:
+    with sitl(
+        tmp_path, ports, "--episodes", "3", goal_m=6.0, speed=4.0, program=FEW_PICTURES
+    ) as run:
         run.find_children("firmware", "companion")
         run.wait_for_text("flight 000")
         ground.wait_flying(0.5, run)
@@ -718,24 +733,34 @@ def occupied(kind: socket.SocketKind) -> Iterator[int]:
         yield held.getsockname()[1]
 
 
+def told_in_one_line(run: Running, port: int, option: str) -> None:
+    (error,) = [line for line in run.text().splitlines() if line.startswith("error:")]
+    assert str(port) in error
+    assert option in error
+    assert "Traceback" not in run.text()
+
+
+def test_a_taken_port_ends_a_firmware(tmp_path: Path) -> None:
+    words = ["-m", "airl_mav.cli.firmware", *choose_ports().options()]
+    with (
+        occupied(socket.SOCK_STREAM) as port,
+        running([*words, "--camera-port", str(port)], tmp_path) as vehicle,
+    ):
+        assert vehicle.wait(60.0) == 2
+    told_in_one_line(vehicle, port, "--camera-port")
+
+
+@pytest.mark.nightly  # The firmware alone: above. What a child tells: test_child_processes.py.
 @pytest.mark.parametrize(
-    ("option", "kind", "named"),
-    [
-        ("--api-port", socket.SOCK_DGRAM, "--api-port"),
-        pytest.param(
-            *("--camera-port", socket.SOCK_STREAM, "--camera-port"), marks=pytest.mark.nightly
-        ),
-    ],
+    ("option", "kind"),
+    [("--api-port", socket.SOCK_DGRAM), ("--camera-port", socket.SOCK_STREAM)],
 )
-def test_taken_port(tmp_path: Path, option: str, kind: socket.SocketKind, named: str) -> None:
+def test_taken_port(tmp_path: Path, option: str, kind: socket.SocketKind) -> None:
     with occupied(kind) as port, sitl(tmp_path, choose_ports(), option, str(port)) as run:
         run.find_children("firmware", "companion")
         assert run.wait() == 2
         run.no_child_left()
-    (error,) = [line for line in run.text().splitlines() if line.startswith("error:")]
-    assert str(port) in error
-    assert named in error
-    assert "Traceback" not in run.text()
+    told_in_one_line(run, port, option)
     # The same command works once the port is free: nothing is in its way.
     assert not (tmp_path / "run").exists()
 

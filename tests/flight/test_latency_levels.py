@@ -102,6 +102,7 @@ def test_another_latency_seed_changes_the_latency_alone(
         assert twin.episodes[index].goal == other.episodes[index].goal
 
 
+@pytest.mark.nightly  # In real time, in one process: test_latency_injection.py.
 def test_two_processes_are_as_late_in_simulated_time(trace: Path, tmp_path: Path) -> None:
     """airl-sitl at four times the speed: a decision takes its trace's time, or a little more."""
     out = tmp_path / "run"

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ast
 import base64
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -17,6 +19,29 @@ from tests.support.processes import ROOT
 NOTEBOOKS = sorted((ROOT / "examples").glob("*.ipynb"))
 
 
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.name)
+def test_the_cells_of_a_notebook_run_one_after_the_other(
+    path: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+    known: dict[str, Any] = {}
+    shown: list[str] = []
+    for cell in (each for each in cells if each["cell_type"] == "code"):
+        assert not cell["outputs"] and cell["execution_count"] is None
+        program = ast.parse("".join(cell["source"]))
+        last = program.body.pop() if isinstance(program.body[-1], ast.Expr) else None
+        exec(compile(program, path.name, "exec"), known)  # noqa: S102 (this project's own)
+        if isinstance(last, ast.Expr):
+            value = eval(compile(ast.Expression(last.value), path.name, "eval"), known)  # noqa: S307
+            shown += [value._repr_html_()] if hasattr(value, "_repr_html_") else []
+    check(shown, capsys.readouterr().out)
+
+
+@pytest.mark.nightly  # A kernel takes longer to start than its cells; in every run: above.
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.name)
 def test_a_notebook_runs_as_it_stands(
@@ -39,6 +64,13 @@ def test_a_notebook_runs_as_it_stands(
         for output in cell.outputs
         if output.output_type == "execute_result" and "text/html" in output.data
     ]
+    printed = "".join(
+        output.text for cell in code for output in cell.get("outputs", ()) if "text" in output
+    )
+    check(shown, printed)
+
+
+def check(shown: list[str], printed: str) -> None:
     assert len(shown) == 3
     for html in shown:
         check_picture(html)
@@ -46,9 +78,6 @@ def test_a_notebook_runs_as_it_stands(
     assert all("of 12 goals reached" in html for html in runs)
     assert "flight time" in curve
     assert "400ms" in curve
-    printed = "".join(
-        output.text for cell in code for output in cell.get("outputs", ()) if "text" in output
-    )
     assert re.search(r"t2: 39\d ms", printed), "the paper's Raspberry Pi: 396 ms"
 
 

@@ -267,7 +267,7 @@ def test_report_again_says_the_same(done: Done) -> None:
         assert word in text
 
 
-@pytest.mark.nightly  # A trace, in two processes: test_latency_levels.py.
+@pytest.mark.nightly  # A trace, in lockstep: test_latency_levels.py.
 def test_injected_latency(tmp_path: Path) -> None:
     """Flown as if the paper's Raspberry Pi decided: 396 ms a decision, and labelled so."""
     arena = write_arena(tmp_path, 24.0)

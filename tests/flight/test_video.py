@@ -309,7 +309,7 @@ def within(seconds: float, look: Any) -> Any:
 @pytest.mark.slow
 @pytest.mark.xdist_group("flight")
 @pytest.mark.timeout(300)
-@pytest.mark.parametrize("instance", [0, 2])
+@pytest.mark.parametrize("instance", [pytest.param(0, marks=pytest.mark.nightly), 2])
 def test_a_ground_station_finds_the_camera_and_its_video(tmp_path: Path, instance: int) -> None:
     ports, moved = ports_of(instance)
     port = udp_port()

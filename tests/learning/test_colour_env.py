@@ -84,7 +84,7 @@ def test_a_checkpoint_goes_on_in_the_same_colours() -> None:
         np.testing.assert_array_equal(ours["grey"], theirs["grey"])
 
 
-# In every run test_colour.py has the fisheye's colours, test_fleet_camera.py its place in the twin:
+# In every run test_colour.py has the fisheye's colours, test_fleet_camera.py its rays in the twin:
 # together they compile for a minute.
 @pytest.mark.parametrize(
     "projection", ["pinhole", pytest.param("fisheye", marks=pytest.mark.nightly)]
@@ -103,6 +103,8 @@ def test_the_image_is_that_of_the_one_caster(kind: CameraKind, projection: Proje
     assert len(np.unique(env.cameras.image)) > 50
 
 
+# Stuck cameras of the twin, of depth: test_twin_faults.py. Colour compiles a renderer of its own.
+@pytest.mark.nightly
 def test_a_camera_that_is_stuck_shows_the_same_picture() -> None:
     (stuck,) = Scenario(faults=("camera stuck at offboard+1s",)).faults
     env = Navigation(spec_of(None, knobs()), 1, faults=[stuck])

@@ -201,7 +201,7 @@ def test_twin_and_pilot_see_the_same(
         EnvironmentSpec.model_validate(
             {
                 "arena": ARENA,
-                "randomisation": {"estimation": False},
+                "randomisation": {"navigation_noise": 0.0},
                 "delay": {
                     "native_ms": t2_ticks * 4.0,
                     "link_ms": link_ticks * 4.0,

@@ -41,7 +41,7 @@ GUSTY = WindSettings(north_m_s=-3.0, east_m_s=2.0, gust_m_s=1.5, gust_time_s=1.0
 SPREAD = Spread(mass=0.1, thrust=0.1, drag=0.5, rotor_lag=0.3)
 K = QUAD.drag.linear_n_s_m
 WEIGHT_N = QUAD.body.mass_kg * GRAVITY_M_S2
-STILL_AIR = {"estimation": False}
+STILL_AIR = {"navigation_noise": 0.0}
 
 
 def navigation(n: int = 1, trace: Trace | None = None, **knobs: object) -> Navigation:

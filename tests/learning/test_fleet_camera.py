@@ -11,6 +11,7 @@ from airl_mav.arena.generate import generate
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.frame import depth_to_z16
 from airl_mav.camera.intrinsics import Intrinsics
+from airl_mav.camera.projection import bent_of
 from airl_mav.camera.render import Mount, camera_pose, render
 from airl_mav.core.frames import quat_from_euler
 from airl_mav.envs.arenas import batch_of
@@ -22,6 +23,8 @@ from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import load_vehicle
 from tests.support.lenses import OPENING
 from tests.support.poses import at_rest
+
+pytestmark = pytest.mark.usefixtures("one_renderer")
 
 N = 12
 CAMERA = Intrinsics.from_fov(64, 48, math.radians(87.0))
@@ -56,10 +59,29 @@ def expected(
     return depth_to_z16(render(world, centers, camera, range_m, *pose))
 
 
+CAMERAS = {"pinhole": CAMERA, "cylindrical": PANORAMA, "fisheye": FISHEYE, "distorted": BENT}
+
+
+@pytest.mark.parametrize("name", CAMERAS)
+def test_the_twins_lens_has_the_rays_of_the_rehearsals(name: str) -> None:
+    camera = CAMERAS[name]
+    lens, rays = lens_of(camera, 20.0), bent_of(camera)
+    assert lens[:5] == (camera.focal, camera.cx, camera.cy, 20.0, camera.cylindrical)
+    assert (lens.bent is None) == (rays is None) == (camera.projection != "fisheye")
+    for ours, theirs in zip(lens.bent or (), rays or (), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
 @pytest.mark.parametrize(
     "camera",
-    [CAMERA, PANORAMA, FISHEYE, BENT],
-    ids=["pinhole", "cylindrical", "fisheye", "distorted"],
+    [
+        CAMERA,
+        PANORAMA,
+        # Their rays are looked at above; the twin with them is compiled for long.
+        pytest.param(FISHEYE, marks=pytest.mark.nightly),
+        pytest.param(BENT, marks=pytest.mark.nightly),
+    ],
+    ids=list(CAMERAS),
 )
 @pytest.mark.parametrize("range_m", [6.0, 20.0, 100.0])
 def test_sees_what_the_rehearsal_s_camera_sees(

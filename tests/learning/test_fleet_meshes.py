@@ -27,6 +27,8 @@ from tests.support.command_line import airl
 from tests.support.lenses import BARREL
 from tests.support.poses import at_rest
 
+pytestmark = pytest.mark.usefixtures("one_renderer")
+
 MOUNT = Mount((0.1, 0.0, 0.02), 0.1)
 CAMERA = Intrinsics.from_fov(48, 32, 1.5)
 FISHEYE = Intrinsics.from_fov(48, 32, 2.8, "fisheye", distortion=BARREL)
@@ -87,7 +89,7 @@ def test_the_worlds_have_meshes_of_both_kinds(worlds: list[Arena]) -> None:
 
 
 @pytest.mark.timeout(600)  # compiles kernels, on a busy machine for minutes
-# Without meshes, test_fleet_camera.py has the twin's fisheye.
+# The rays of the twin's fisheye: test_fleet_camera.py.
 @pytest.mark.parametrize(
     "camera",
     [CAMERA, pytest.param(FISHEYE, marks=pytest.mark.nightly)],

@@ -40,7 +40,7 @@ from companion.watchdog import Watchdog
 
 QUAD = load_vehicle("quad")
 VEHICLE = vehicle_of(QUAD, parameter_values(QUAD.parameters).__getitem__)
-TRUE_STATE = {"estimation": False}
+TRUE_STATE = {"navigation_noise": 0.0}
 TICK_US = 4000
 PERIOD_US = 33_333
 """Of the quad's camera, 30 Hz."""
@@ -482,10 +482,20 @@ def test_the_held_altitude_is_the_one_that_telemetry_tells() -> None:
     assert height == pytest.approx(2.5 + error, abs=0.03)
 
 
-def test_without_estimation_telemetry_is_the_truth() -> None:
-    navigation = Navigation(spec_with(arena="no-obstacles"), 2)
+@pytest.mark.parametrize(
+    ("without", "flies"),
+    [
+        (TRUE_STATE, True),
+        ({"estimation": False}, False),
+        # Decisions without a drift of errors are compiled anew.
+        pytest.param({"estimation": False}, True, marks=pytest.mark.nightly),
+    ],
+)
+def test_without_estimation_telemetry_is_the_truth(without: dict[str, object], flies: bool) -> None:
+    navigation = Navigation(spec_with(arena="no-obstacles", randomisation=without), 2)
     navigation.begin([0, 1], [1, 2])
-    navigation.fly(np.ones((2, 3)))
+    if flies:
+        navigation.fly(np.ones((2, 3)))
     truth, told = navigation.truth(), navigation.kinematics()
     assert np.array_equal(truth.position, told.position)
     assert np.array_equal(truth.velocity, told.velocity)
@@ -527,7 +537,7 @@ def test_an_ended_flight_stays_as_it_ended() -> None:
 def test_begins_in_a_hover_that_stays_where_it_is(mass: float, sag_m: float) -> None:
     """Without a command the vehicle does not drift; one of another mass sags, and comes back."""
     spec = spec_with(
-        arena="no-obstacles", randomisation={"mass": mass, "thrust": mass, "estimation": False}
+        arena="no-obstacles", randomisation={"mass": mass, "thrust": mass, **TRUE_STATE}
     )
     navigation = Navigation(spec, 6)
     navigation.begin(range(6), range(6))

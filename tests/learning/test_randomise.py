@@ -130,9 +130,9 @@ def test_no_noise_leaves_the_image_alone() -> None:
 
 def test_depth_noise_is_new_with_every_frame_and_exact_by_seed() -> None:
     spec = EnvironmentSpec(
-        randomisation={"depth_noise": 0.02, "depth_dropout": 0.1, "estimation": False}
+        randomisation={"depth_noise": 0.02, "depth_dropout": 0.1, "navigation_noise": 0.0}
     )
-    clean = Navigation(EnvironmentSpec(randomisation={"estimation": False}), 1)
+    clean = Navigation(EnvironmentSpec(randomisation={"navigation_noise": 0.0}), 1)
     pair = [Navigation(spec, 1), Navigation(spec, 1)]
     for each in (clean, *pair):
         each.begin([0], [3])

@@ -102,7 +102,7 @@ def test_failures_are_collisions_and_empty_batteries_not_timeouts() -> None:
 def test_the_environment_pays_what_the_formula_says(name: str) -> None:
     """Distances and speeds from telemetry that anybody can read in the observation."""
     env = NavigationVectorEnv(
-        3, reward=name, arena="no-obstacles", randomisation={"estimation": False}
+        3, reward=name, arena="no-obstacles", randomisation={"navigation_noise": 0.0}
     )
     _, info = env.reset(seed=[1, 2, 3])
     distance = info["goal_distance_m"]

@@ -10,10 +10,13 @@ from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import pytest
 
+from airl_mav.cli import sweep as sweep_command
 from airl_mav.core.errors import EXIT_INTERRUPTED
+from airl_mav.experiments.process_executor import open_executor
 from airl_mav.policy.card import read_card
 from airl_mav.policy.template import Size
 from airl_mav.sweep.config import load_sweep
@@ -45,8 +48,9 @@ def sweep(folder: Path, *options: str) -> list[str]:
 
 
 def swept(folder: Path, *options: str) -> str:
-    """Carry out a sweep in this process; return what it printed."""
-    code, text = airl("sweep", *sweep(folder, *options)[len(COMMAND) :])
+    """Carry out a sweep in this process, its trainings too; return what it printed."""
+    with patch.object(sweep_command, "open_executor", partial(open_executor, in_process=True)):
+        code, text = airl("sweep", *sweep(folder, *options)[len(COMMAND) :])
     assert code == 0, text
     return text
 
@@ -93,7 +97,7 @@ def checkpointed(folder: Path, before: frozenset[str] = frozenset()) -> frozense
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("undisturbed")
-    (folder / "said").write_text(swept(folder, "--workers", "1"), encoding="utf-8")
+    (folder / "said").write_text(swept(folder), encoding="utf-8")
     return folder
 
 

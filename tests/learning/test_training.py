@@ -83,8 +83,8 @@ def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def straight(short: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run that nobody disturbed."""
     out = tmp_path_factory.mktemp("straight") / "run"
-    done = train(short, out)
-    assert done.returncode == 0, done.stderr
+    code, text = airl("train", str(short), "--out", str(out))
+    assert code == 0, text
     return out
 
 

@@ -40,7 +40,7 @@ def fault(words: str) -> Fault:
 
 def navigation(*faults: str, trace: Trace | None = None, n: int = 1, **knobs: object) -> Navigation:
     spec = spec_of(
-        None, {"arena": "static-obstacles", "randomisation": {"estimation": False}, **knobs}
+        None, {"arena": "static-obstacles", "randomisation": {"navigation_noise": 0.0}, **knobs}
     )
     return Navigation(spec, n, trace=trace, faults=[fault(words) for words in faults])
 

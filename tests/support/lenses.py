@@ -1,13 +1,13 @@
-"""Fisheyes with coefficients, and where they look by a solver of scipy's."""
+"""Fisheyes with coefficients, and where they look by bisection."""
 
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
 
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.profiles.distortion import Distortion
@@ -28,27 +28,31 @@ def published(theta: Any, k: Distortion) -> Any:
     return theta * (1 + k1 * theta**2 + k2 * theta**4 + k3 * theta**6 + k4 * theta**8)
 
 
-def last_angle(k: Distortion) -> float:
-    """Return to which angle [rad] theta_d increases, by looking at it closely; at most 95 deg."""
+@cache
+def rising(k: Distortion) -> NDArray[np.float64]:
+    """Return angles [rad], close to each other, as long as theta_d increases; to 95 degrees."""
     theta = np.linspace(0.0, math.radians(95.0), 200_001)
     falls = np.flatnonzero(np.diff(published(theta, k)) <= 0.0)
-    return float(theta[falls[0]]) if len(falls) else math.radians(95.0)
+    return theta[: falls[0] + 1] if len(falls) else theta
+
+
+def last_angle(k: Distortion) -> float:
+    """Return to which angle [rad] theta_d increases, by looking at it closely; at most 95 deg."""
+    return float(rising(k)[-1])
 
 
 def angles(theta_d: NDArray[np.float64], k: Distortion) -> NDArray[np.float64]:
-    """Return the angles off the axis [rad] that fall at theta_d, by Brent's method; NaN: none."""
-    last = last_angle(k)
-    rim = published(last, k)
-
-    def one(wanted: float) -> float:
-        if wanted > rim:
-            return math.nan
-        found: float = brentq(lambda at: published(at, k) - wanted, 0.0, last, xtol=1e-15)
-        return found
-
+    """Return the angles off the axis [rad] that fall at theta_d, by bisection; NaN: none."""
     # A place and its mirror images are at one angle.
     places, which = np.unique(theta_d, return_inverse=True)
-    solved = np.array([one(float(each)) for each in places])
+    theta = rising(k)
+    after = published(theta, k).searchsorted(places).clip(1, len(theta) - 1)
+    low, high = theta[after - 1], theta[after]
+    for _ in range(40):  # to the last digit of a float64
+        middle = 0.5 * (low + high)
+        beyond = published(middle, k) > places
+        low, high = np.where(beyond, low, middle), np.where(beyond, middle, high)
+    solved = np.where(places > published(theta[-1], k), math.nan, 0.5 * (low + high))
     return solved[which].reshape(theta_d.shape)
 
 

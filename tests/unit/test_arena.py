@@ -524,7 +524,10 @@ def test_passage_agrees_with_a_distance_transform(seed: int, n: int, width: floa
         assert not way_exists(arena, width + 1.0)
 
 
-def test_walled_in_start_is_redrawn_or_refused() -> None:
+@pytest.mark.parametrize(
+    "seeds", [range(10, 13), pytest.param(range(30), marks=pytest.mark.nightly)]
+)
+def test_walled_in_start_is_redrawn_or_refused(seeds: range) -> None:
     """Boxes with hardly a gap: the generator keeps only layouts with a way."""
     spec = spec_of(
         size={"north_m": 40, "east_m": 9, "height_m": 5},
@@ -534,7 +537,7 @@ def test_walled_in_start_is_redrawn_or_refused() -> None:
         static={"count": [26, 26], "half_width_m": [0.8, 1.2], "shapes": ["box"]},
     )
     outcomes = set()
-    for seed in range(30):
+    for seed in seeds:
         try:
             arena = make(spec, seed, width=1.2)
         except UsageError as error:
@@ -544,7 +547,7 @@ def test_walled_in_start_is_redrawn_or_refused() -> None:
             gaps = gaps_suffice(arena.bounds, arena.obstacles, arena.goal, 1.2)
             outcomes.add("wide gaps" if gaps else "found a way")
             assert way_exists(arena, 1.2 - 0.2)
-    assert "found a way" in outcomes
+    assert outcomes >= {"found a way", "refused"}
 
 
 def test_free_area_fraction_matches_a_raster() -> None:

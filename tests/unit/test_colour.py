@@ -26,6 +26,8 @@ from airl_mav.profiles.camera_kind import PROJECTIONS, Projection
 from airl_mav.profiles.loading import load_profile
 from tests.support.lenses import rays_of_fisheye
 
+pytestmark = pytest.mark.usefixtures("one_renderer")
+
 LEVEL = quat_from_euler(0.0, 0.0, 0.0)
 DOWN = quat_from_euler(0.0, -math.pi / 2, 0.0)
 FAR = 10_000.0

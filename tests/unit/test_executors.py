@@ -207,7 +207,12 @@ def test_a_worker_has_one_thread_and_is_deaf_to_ctrl_c() -> None:
 
 
 @pytest.mark.parametrize(
-    ("how", "name"), [("kill", "SIGKILL"), ("exit", "exit status 7"), ("half", "exit status 7")]
+    ("how", "name"),
+    [
+        ("kill", "SIGKILL"),
+        pytest.param("exit", "exit status 7", marks=pytest.mark.nightly),
+        ("half", "exit status 7"),
+    ],
 )
 def test_the_job_of_a_lost_worker_is_given_to_another(tmp_path: Path, how: str, name: str) -> None:
     lost: list[str] = []

@@ -30,6 +30,8 @@ from airl_mav.profiles.vehicle import load_vehicle
 from tests.support.lenses import BARREL, OPENING, published, rays_of_fisheye
 from tests.unit.test_colour import arena, busy, poses, sun
 
+pytestmark = pytest.mark.usefixtures("one_renderer")
+
 WIDE = Intrinsics(191, 191, 180.0 / math.pi, 95.0, 95.0, "fisheye")
 """A pixel a degree, in every direction."""
 

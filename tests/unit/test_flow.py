@@ -24,6 +24,8 @@ from airl_mav.profiles.loading import load_profile
 from tests.support.lenses import BARREL, OPENING, published
 from tests.unit.test_colour import rays_of
 
+pytestmark = pytest.mark.usefixtures("one_renderer")
+
 FOV = {"pinhole": 1.6, "cylindrical": 2.0 * math.pi, "fisheye": math.radians(190.0)}
 STEP_S = 1e-4
 

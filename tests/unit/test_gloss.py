@@ -26,7 +26,7 @@ from airl_mav.camera.gloss import (
     spread,
 )
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.picture import Picture, render_picture
+from airl_mav.camera.picture import ColourArrays, Picture, render_picture
 from airl_mav.camera.render import camera_pose
 from airl_mav.core.frames import quat_from_euler
 from airl_mav.envs.arenas import batch_of
@@ -37,6 +37,8 @@ from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from tests.learning.test_fleet_meshes import MOUNT, scattered
 from tests.support.meshes import kept, ring, scene_of, triangles
+
+pytestmark = pytest.mark.usefixtures("one_renderer")
 
 UP = (0.0, 0.0, -1.0)
 CAMERA = Intrinsics.from_fov(64, 48, math.pi / 2)
@@ -258,6 +260,29 @@ def shiny_worlds() -> list[Arena]:
     ]
 
 
+def test_the_twin_has_the_surfaces_of_the_rehearsal() -> None:
+    """In each slot, whichever arena it had before."""
+    worlds = shiny_worlds()
+    looks, n = Looks(len(worlds)), len(worlds)
+    for order in (range(n), reversed(range(n))):
+        for i in order:
+            looks.put(i, worlds[n - 1 - i])
+            looks.put(i, worlds[i])
+        assert looks.gloss is not None
+        for i, world in enumerate(worlds):
+            known = ColourArrays.of(world.look)
+            assert known.gloss is not None
+            rows = len(known.texture)
+            for name, theirs in known.gloss._asdict().items():
+                np.testing.assert_array_equal(getattr(looks.gloss, name)[i, :rows], theirs)
+            for name in ("texture", "per_m", "offset", "albedo"):
+                theirs = getattr(known, name)
+                np.testing.assert_array_equal(getattr(looks.batch, name)[i, :rows], theirs)
+            np.testing.assert_array_equal(looks.batch.lights[i], known.lights)
+
+
+# In every run: the rows of the twin, above, and its images of matt surfaces in test_colour_env.py.
+@pytest.mark.nightly
 @pytest.mark.timeout(600)  # compiles kernels
 def test_the_twins_images_are_those_of_the_rehearsal() -> None:
     worlds = shiny_worlds()

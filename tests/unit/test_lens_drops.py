@@ -24,6 +24,8 @@ from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from tests.learning.test_fleet_meshes import MOUNT, scattered
 
+pytestmark = pytest.mark.usefixtures("one_renderer")
+
 CAMERA = Intrinsics.from_fov(64, 48, 1.5)
 WET: dict[str, Any] = {"drops": [10, 30], "size": [0.05, 0.2], "streak": [1, 3]}
 
@@ -103,15 +105,46 @@ def wet_world(seed: int, **rain: Any) -> Arena:
     return generate(spec, seed, name="wet", vehicle_width_m=0.55)
 
 
-@pytest.mark.timeout(600)  # compiles kernels
-@pytest.mark.parametrize("channels", [1, 3])
-def test_the_twins_drops_are_those_of_the_rehearsal(channels: int) -> None:
-    worlds = [
+def wet_worlds() -> list[Arena]:
+    return [
         wet_world(1, drops=[0, 0]),
         wet_world(2, drops=[5, 5]),
         wet_world(3, drops=[40, 40]),
         wet_world(4, **WET, share=0.5),
     ]
+
+
+def test_the_twin_has_the_drops_of_the_rehearsal() -> None:
+    """In each slot, whichever arena it had before."""
+    worlds = wet_worlds()
+    looks = Looks(len(worlds))
+    for order in ((0, 1, 2, 3), (3, 0, 2, 1)):
+        for i in order:
+            looks.put(i, worlds[order[i]])
+            looks.put(i, worlds[i])
+        assert looks.rain is not None
+        for i, world in enumerate(worlds):
+            drops = world.look.drops
+            assert looks.rain.present[i] == len(drops)
+            np.testing.assert_array_equal(looks.rain.drops[i, : len(drops)], drops)
+
+
+def test_a_picture_is_what_is_behind_its_drops() -> None:
+    (world, dry), pose = (wet_world(3, drops=[n, n]) for n in (40, 0)), (np.zeros(3), np.eye(4)[0])
+    shown, expected = (
+        render_picture(each, each.centers_at(0), CAMERA, *pose).rgb for each in (world, dry)
+    )
+    assert (shown != expected).any()
+    rained_on(expected, world.look.drops)
+    np.testing.assert_array_equal(shown, expected)
+
+
+# In every run: what the twin has, above, and its dry images in test_colour_env.py.
+@pytest.mark.nightly
+@pytest.mark.timeout(600)  # compiles kernels
+@pytest.mark.parametrize("channels", [1, 3])
+def test_the_twins_drops_are_those_of_the_rehearsal(channels: int) -> None:
+    worlds = wet_worlds()
     n = len(worlds)
     camera = replace(CAMERA, kind="rgb" if channels == 3 else "grey")
     looks, fleet, changed = Looks(n), scattered(n), 0

@@ -27,6 +27,8 @@ from airl_mav.profiles.distortion import UNDISTORTED, sees_to
 from tests.support.lenses import BARREL, ENDING, OPENING, rays_of_fisheye
 from tests.support.meshes import ROOM, kept, ring, scene_of, triangles
 
+pytestmark = pytest.mark.usefixtures("one_renderer")
+
 Floats = NDArray[np.float64]
 
 

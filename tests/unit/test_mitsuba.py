@@ -29,6 +29,8 @@ from airl_mav.profiles.loading import load_profile
 from tests.support.lenses import BARREL
 from tests.support.meshes import kept, ring, scene_of, triangles
 
+pytestmark = pytest.mark.usefixtures("one_renderer")
+
 pytest.importorskip("mitsuba")
 
 LIGHT: dict[str, Any] = {
@@ -152,8 +154,8 @@ def test_a_blue_sky_is_theirs() -> None:
 
 INDOORS = [
     (1, (0.0, 0.0, -2.5), 0.0),
-    (3, (10.0, 5.0, -1.5), -1.0),
-    (4, (20.0, -5.0, -3.0), 3.0),
+    pytest.param(3, (10.0, 5.0, -1.5), -1.0, marks=pytest.mark.nightly),
+    pytest.param(4, (20.0, -5.0, -3.0), 3.0, marks=pytest.mark.nightly),
     (5, (15.0, 8.0, -2.0), 1.0),
 ]
 
@@ -175,7 +177,7 @@ def test_rooms_below_a_ceiling_are_within_three_percent(
     assert difference(scene, position, yaw, rays=4)[0] > 1.3 * inner
 
 
-@pytest.mark.parametrize("material", ["plaster", "brick"])
+@pytest.mark.parametrize("material", [pytest.param("plaster", marks=pytest.mark.nightly), "brick"])
 def test_meshes_are_theirs(material: str, tmp_path: Path) -> None:
     """Triangles with their shadows, and with bricks as they lie on them."""
     file = kept(triangles(ring()), tmp_path / "ring.npz")
@@ -298,7 +300,7 @@ def test_the_same_seed_draws_the_same_bent_image() -> None:
 
 
 @pytest.mark.timeout(600)  # compiles kernels, on a busy machine for minutes
-@pytest.mark.parametrize("material", ["earth", "grass"])
+@pytest.mark.parametrize("material", [pytest.param("earth", marks=pytest.mark.nightly), "grass"])
 def test_hills_are_theirs(material: str) -> None:
     """Triangles above the floor in its material, whose pattern goes on over them."""
     scene = arena("hills", 3, **{**LIGHT, **PLAIN, "floor": {"materials": [material]}})

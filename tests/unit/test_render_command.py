@@ -22,6 +22,8 @@ from airl_mav.profiles.loading import load_profile
 from airl_mav.report.depth_colours import coloured
 from tests.support.lenses import BARREL
 
+pytestmark = pytest.mark.usefixtures("one_renderer")
+
 SMALL = ("--width-px", "64", "--height-px", "48")
 POSE = ("--north-m", "8", "--east-m", "-2", "--height-m", "3", "--yaw-deg", "20")
 

@@ -35,6 +35,8 @@ from airl_mav.profiles.terrain import MOST_CELLS, Terrain
 from tests.support.meshes import kept, ring, scene_of, triangles
 from tests.unit.test_meshes_seen import in_world, nearest, rays_of
 
+pytestmark = pytest.mark.usefixtures("one_renderer")
+
 Floats = NDArray[np.float64]
 
 HILLS = load_profile("arenas", "hills", ArenaSpec)
