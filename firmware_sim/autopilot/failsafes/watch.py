@@ -162,6 +162,7 @@ class Watch:
         self._vision_fused = False
         self._restarts = 0
         self._compass_given_up = False
+        self._armed = False
         self._calm: tuple[object, ...] | None = None
         """What was reported and heard at a look that found nothing unusual; None = it did."""
         self.read_parameters()
@@ -221,8 +222,8 @@ class Watch:
         conditions = self._conditions(sample, phase)
         texts += self._texts(conditions, now_us, phase)
         seen[:3], seen[3:] = sample.accel, sample.gyro
-        usual = phase >= _GROUND and self._is_usual(conditions, now_us)
-        self._calm = self._reported(now_us) if usual else None
+        self._armed = phase >= _GROUND
+        self._calm = self._reported(now_us) if self._is_usual(conditions, now_us) else None
         return conditions, texts
 
     @property
@@ -247,6 +248,7 @@ class Watch:
             *(reports.fence, reports.mission_missing, reports.mission_failure),
             *(reports.navigator_failure, self.motors.failed, recovery.compass.given_up),
             *(recovery.consistency.restarts, self._estimator.compiled),
+            not self._armed and self._estimator.field_disturbed,
         )
 
     def _is_usual(self, found: Conditions, now_us: int) -> bool:
