@@ -142,14 +142,12 @@ def _level(m: Vector, gyro: Vec, force: Vec, dt: float) -> None:
 
 @kernel
 def _predict(m: Vector, accel: Vec, dt: float) -> tuple[float, float]:
-    """Move a model's velocity and heading, and their covariance P = F P F' + Q.
+    """Move a model's velocity, and its covariance P = F P F' + Q with the heading's.
 
     Of F only the column of the heading differs from the identity's: a heading error turns the
     change of velocity, which is returned (north, east).
     """
-    q = _quat(m)
-    m[YAW] = yaw_of(q)
-    north, east, _ = rotate(q, (accel[0] * dt, accel[1] * dt, accel[2] * dt))
+    north, east, _ = rotate(_quat(m), (accel[0] * dt, accel[1] * dt, accel[2] * dt))
     by_n, by_e = -east, north
     ny = m[P_NY] + by_n * m[P_YY]
     ey = m[P_EY] + by_e * m[P_YY]
@@ -208,6 +206,9 @@ def advance(models: Vector, shared: Vector, gyro: Vector, accel: Vector, dt: flo
                 north, east = _predict(models[j], a, dt)
                 if j == 0:
                     _add_change(shared, north, east)
+    if len(gyro) > 0 and shared[STARTED] != 0.0:
+        for j in range(N_MODELS):
+            models[j, YAW] = yaw_of(_quat(models[j]))
 
 
 @kernel
