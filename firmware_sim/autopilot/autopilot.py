@@ -267,7 +267,6 @@ class BuiltinAutopilot:
         climb = self._guidance.context.climb
         if climb.has_ended or self._due_us == 0:
             return False
-        self.record["climb_due_us"] = self._taken_us
         if not supervisor.is_unchanged(self._taken_us, flight):
             return False
         self._commander.obey(NO_INTERVENTION)
@@ -276,6 +275,14 @@ class BuiltinAutopilot:
             return False
         self._navigator.due_us = self._taken_us + IDLE_US
         self._due_us = min(supervisor.next_us, self._navigator.due_us)
+        if climb.flies:
+            self.record["climb_due_us"] = self._taken_us
+        else:  # A mode may count on being asked: offboard follows another kind of setpoint then.
+            self._demand = self._guidance.demand(self._state, _AIR, self._taken_us)
+            self._controller.command(self._demand)
+            self._is_settled = self._guidance.is_steady(_AIR)
+            if not self._is_settled:
+                self._due_us = min(self._due_us, self._taken_us + DECIDE_US)
         return True
 
     def _look_for_news(self) -> bool:

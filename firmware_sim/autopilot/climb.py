@@ -10,8 +10,6 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
-from numba.extending import register_jitable
-
 from airl_mav.core.constants import GRAVITY_M_S2, US_PER_S
 from airl_mav.core.frames import Vector
 from airl_mav.core.kernels import kernel
@@ -46,7 +44,7 @@ the last speed of the ramp [m/s]."""
 _GENTLY, _UP, _DOWN = range(3)
 """Rows of `climb_limits`, each as `ClimbLimits`."""
 
-register_jitable(braking_speed)
+_braking_speed = kernel(braking_speed)
 
 
 class ClimbLimits(NamedTuple):
@@ -73,7 +71,7 @@ def move_on(c: Fields, now_us: int) -> None:
     own[HEIGHT] += own[SPEED] * elapsed_s
     left_m = own[TARGET] - own[HEIGHT]
     # The greatest speed that can still be braked.
-    wanted = math.copysign(min(speed, braking_speed(abs(left_m), acceleration, jerk)), left_m)
+    wanted = math.copysign(min(speed, _braking_speed(abs(left_m), acceleration, jerk)), left_m)
     most = acceleration * elapsed_s
     own[SPEED] += min(most, max(-most, wanted - own[SPEED]))
 
