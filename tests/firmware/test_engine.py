@@ -10,14 +10,17 @@ import numpy as np
 import pytest
 
 from airl_mav.arena.generate import generate
+from airl_mav.control.demand import AttitudeDemand
 from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import TICK_US
 from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.vehicle import load_vehicle
 from airl_mav.scenario.aircraft import Aircraft
+from firmware_sim.autopilot.autopilot import BuiltinAutopilot
 from firmware_sim.autopilot.autopilot_state import Mode, Setpoint
 from firmware_sim.autopilot.commander import Phase
+from firmware_sim.autopilot.failsafes.watch import Watch
 from firmware_sim.engine.record import FLOWN_TICK, TRUE_TICK, Record
 from firmware_sim.mavlink.codec import message_id
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
@@ -107,6 +110,59 @@ def test_python_flies_the_same_to_rounding(
     np.testing.assert_allclose(truths["motion"], logs[0]["motion"], atol=1e-5)
     np.testing.assert_allclose(truths["charge"], logs[0]["charge"], atol=1e-9)
     np.testing.assert_allclose(ticks["state"][:, :20], logs[1]["state"][:, :20], atol=1e-5)
+
+
+def eventful(simulation: Simulation) -> tuple[bytes, list[tuple[int, str]]]:
+    """Fly with a lost ground station, setpoints of two kinds, silence and a low battery.
+
+    Returns the log of the flight controller, and the texts with their times.
+    """
+    ticks, texts = [], []
+    autopilot = simulation.autopilot.internals
+    assert autopilot is not None
+    for step in range(240):
+        end_us = (step + 1) * STEP_US
+        while simulation.time_us < end_us:
+            simulation.advance(end_us)
+            ticks.append(simulation.flown.tobytes())
+            texts += [(simulation.time_us, each.text) for each in autopilot.take_messages()]
+        now_us = simulation.time_us
+        if step < 60 or step > 180:
+            autopilot.gcs_heartbeat(now_us)
+        if step == 20:
+            assert autopilot.arm(force=False) == 0
+            autopilot.takeoff(2.5)
+        if 98 <= step < 150 and step % 13 < 8:
+            velocity = np.array([0.5 * math.sin(step), 0.5, 0.0])
+            autopilot.offer_setpoint(Setpoint(NAN3, velocity, math.nan, 0.2), now_us)
+        elif 98 <= step < 150:
+            level = AttitudeDemand((1.0, 0.0, 0.0, 0.0), 0.1, 0.5)
+            autopilot.offer_attitude(level, now_us)
+        if step == 100:
+            assert autopilot.set_mode(Mode.OFFBOARD) == 0
+        if step == 140:
+            simulation.plant.battery_remaining = 0.12
+    return b"".join(ticks), texts
+
+
+def test_what_finds_nothing_new_changes_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Looks of the failsafes that are compiled, and setpoints that are followed without them."""
+    with closing(new_simulation()) as simulation:
+        ticks, texts = eventful(simulation)
+    asked = []
+
+    def judge_all(watch: Watch, now_us: int) -> bool:
+        asked.append(now_us)
+        return False
+
+    monkeypatch.setattr(Watch, "is_unchanged", judge_all)
+    monkeypatch.setattr(BuiltinAutopilot, "_follow", lambda _: False)
+    with closing(new_simulation()) as simulation:
+        assert (ticks, texts) == eventful(simulation)
+    assert len(asked) > 50
+    told = " ".join(text for _, text in texts)
+    for word in ("Connection to ground station lost", "GCS connection regained", "battery"):
+        assert word in told, texts
 
 
 def test_telemetry_does_not_depend_on_it_either() -> None:
