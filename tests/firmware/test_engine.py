@@ -34,6 +34,9 @@ from firmware_sim.simulation import EpisodeSetup, Simulation
 STEP_US = 100_000
 """Requests come so often."""
 
+UNALIGNED_US = 68_000
+"""So often that they do not come with the looks of the failsafes."""
+
 NAN3 = np.full(3, math.nan)
 
 
@@ -120,27 +123,28 @@ def eventful(simulation: Simulation) -> tuple[bytes, list[tuple[int, str]]]:
     ticks, texts = [], []
     autopilot = simulation.autopilot.internals
     assert autopilot is not None
-    for step in range(240):
-        end_us = (step + 1) * STEP_US
+    for step in range(340):
+        end_us = (step + 1) * UNALIGNED_US
         while simulation.time_us < end_us:
             simulation.advance(end_us)
             ticks.append(simulation.flown.tobytes())
             texts += [(simulation.time_us, each.text) for each in autopilot.take_messages()]
+            autopilot.take_events()
         now_us = simulation.time_us
-        if step < 60 or step > 180:
+        if step < 85 or step > 260:
             autopilot.gcs_heartbeat(now_us)
-        if step == 20:
+        if step == 28:
             assert autopilot.arm(force=False) == 0
             autopilot.takeoff(2.5)
-        if 98 <= step < 150 and step % 13 < 8:
+        if 140 <= step < 215 and step % 10 == 0:
             velocity = np.array([0.5 * math.sin(step), 0.5, 0.0])
             autopilot.offer_setpoint(Setpoint(NAN3, velocity, math.nan, 0.2), now_us)
-        elif 98 <= step < 150:
+        elif 140 <= step < 215 and step % 10 == 5:
             level = AttitudeDemand((1.0, 0.0, 0.0, 0.0), 0.1, 0.5)
             autopilot.offer_attitude(level, now_us)
-        if step == 100:
+        if step == 143:
             assert autopilot.set_mode(Mode.OFFBOARD) == 0
-        if step == 140:
+        if step == 200:
             simulation.plant.battery_remaining = 0.12
     return b"".join(ticks), texts
 
