@@ -118,7 +118,7 @@ class BuiltinAutopilot:
         """The commander's state and the setpoint that the newest decision is of."""
         self._decided_healthy = 0
         """Whether the estimator was healthy then, 0 or 1."""
-        self._is_settled = False
+        self._is_steady = False
         """Whether its demand stays the same in the air until something changes."""
         self._told: tuple[object, ...] = ()
         self._unsaid = 0
@@ -229,9 +229,8 @@ class BuiltinAutopilot:
     def decide_if_due(self) -> float:
         """Decide where something is due or has arrived; return when to ask again [µs]."""
         flight, setpoint = self._decided_on
-        changed = flight is not self._commander.flight or self._decided_healthy != self.record[
-            "healthy"
-        ].item(0)
+        healthy = self.record["healthy"].item(0)
+        changed = flight is not self._commander.flight or healthy != self._decided_healthy
         due_us = min(self._due_us, self.supervisor.next_us, self._navigator.due_us)
         due, follows = self._taken_us >= due_us, setpoint is self._guidance.context.setpoint
         if not (changed or due or follows):
@@ -245,7 +244,7 @@ class BuiltinAutopilot:
     def _is_undisturbed(self) -> bool:
         """Return whether the newest decision holds but for setpoints and looks."""
         said = len(self._messages) + len(self._events) > self._unsaid
-        if said or not self._is_settled or self._manual_control.was_heard:
+        if said or not self._is_steady or self._manual_control.was_heard:
             return False
         return self._home.place is not None and not self._guidance.is_done(self._state)
 
@@ -280,8 +279,8 @@ class BuiltinAutopilot:
         else:  # A mode may count on being asked: offboard follows another kind of setpoint then.
             self._demand = self._guidance.demand(self._state, _AIR, self._taken_us)
             self._controller.command(self._demand)
-            self._is_settled = self._guidance.is_steady(_AIR)
-            if not self._is_settled:
+            self._is_steady = self._guidance.is_steady(_AIR)
+            if not self._is_steady:
                 self._due_us = min(self._due_us, self._taken_us + DECIDE_US)
         return True
 
@@ -312,7 +311,7 @@ class BuiltinAutopilot:
             self.supervisor.next_us, self._navigator.due_us, self._auto_disarm.due_us
         )
         steady = self._guidance.is_steady(phase) and not self._manual_control.was_heard
-        self._is_settled = steady and phase is _AIR
+        self._is_steady = steady and phase is _AIR
         if not steady:
             self._due_us = min(self._due_us, self._taken_us + DECIDE_US)
 
@@ -647,6 +646,6 @@ class BuiltinAutopilot:
         if self._taken_us < 0:
             raise RuntimeError("no tick yet: the autopilot has no state")
         calm = self.supervisor.is_calm and self._newest.esc_outputs is None
-        settled = self._told if calm else None
-        self._snapshot = Snapshot(self._parts, self._taken_us, self._demand, settled)
+        revision = self._told if calm else None
+        self._snapshot = Snapshot(self._parts, self._taken_us, self._demand, revision)
         return self._snapshot

@@ -288,7 +288,7 @@ class AutopilotState(Protocol):
         """Simulated time of the tick [µs]."""
 
     @property
-    def settled(self) -> object:
+    def revision(self) -> object:
         """The same object as long as nothing has changed that a tick's log lacks; None = it may."""
 
     @property

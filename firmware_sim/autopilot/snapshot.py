@@ -68,10 +68,10 @@ class Snapshot:
 
     load = 0.0
 
-    __slots__ = ("_controlled", "_demand", "_health", "_parts", "settled", "status", "time_us")
+    __slots__ = ("_controlled", "_demand", "_health", "_parts", "revision", "status", "time_us")
 
     def __init__(
-        self, parts: Parts, time_us: int, demand: AnyDemand | None, settled: object
+        self, parts: Parts, time_us: int, demand: AnyDemand | None, revision: object
     ) -> None:
         """Take it after a tick.
 
@@ -79,10 +79,10 @@ class Snapshot:
             parts: Of the autopilot.
             time_us: Of the tick [µs].
             demand: What is flown; None = the motors are stopped.
-            settled: As `AutopilotState`.
+            revision: As `AutopilotState`.
         """
         self._parts, self.time_us, self._demand = parts, time_us, demand
-        self.settled = settled
+        self.revision = revision
         self.status: CommanderStatus = parts.commander.status
         self._controlled: ControlSetpoints | None = None
         self._health: Health | None = None

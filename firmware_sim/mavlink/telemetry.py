@@ -239,7 +239,7 @@ class TickContext:
 
     def __init__(self) -> None:
         self._values: tuple[float, ...] = ()
-        self._settled: object = None
+        self._revision: object = None
         self.row = np.zeros(0)
         """The newest values."""
 
@@ -250,8 +250,8 @@ class TickContext:
         satellites and accuracies of the newest fix, outputs that the speed controllers report,
         bits of SYS_STATUS, load.
         """
-        settled, self._settled = self._settled, state.settled
-        if settled is not None and settled is self._settled:
+        revision, self._revision = self._revision, state.revision
+        if revision is not None and revision is self._revision:
             return self.row
         origin, home, goal, fix = state.origin, state.home, state.destination, state.gps
         ground = state.clearance

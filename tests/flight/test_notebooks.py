@@ -36,7 +36,7 @@ def test_the_cells_of_a_notebook_run_one_after_the_other(
         last = program.body.pop() if isinstance(program.body[-1], ast.Expr) else None
         exec(compile(program, path.name, "exec"), known)  # noqa: S102 (this project's own)
         if isinstance(last, ast.Expr):
-            value = eval(compile(ast.Expression(last.value), path.name, "eval"), known)  # noqa: S307
+            value = eval(compile(ast.Expression(last.value), path.name, "eval"), known)  # noqa: S307 (as above)
             shown += [value._repr_html_()] if hasattr(value, "_repr_html_") else []
     check(shown, capsys.readouterr().out)
 

@@ -108,7 +108,7 @@ class KnownState(NamedTuple):
     flow: FlowReading | None = None
     flow_us: int = 0
     clearance: Clearance | None = None
-    settled: None = None
+    revision: None = None
 
 
 class Parameters:
