@@ -187,6 +187,11 @@ class FailingEndpoint(FailingSender):
             timeline.on_change(self._rearrange)
             self._rearrange()
 
+    @property
+    def is_polled(self) -> bool:
+        """Whether something may have arrived although its descriptor is not readable."""
+        return not self._up.quiet or self._shared.is_polled
+
     def receive(self) -> list[bytes]:
         """Return all chunks that have arrived, oldest first."""
         return [chunk for _, chunk in self.arrivals()]

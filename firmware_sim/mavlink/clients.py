@@ -9,7 +9,7 @@ another.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from airl_mav.core.constants import US_PER_S
@@ -74,7 +74,7 @@ class Client:
             or self.late
             or self.link.pending
             or self.announced_origin is None
-            or (events is not None and events.has_news(now_us))
+            or (events is not None and events.next_us <= now_us)
         )
 
     def next_us(self, now_us: int) -> float:
@@ -128,6 +128,7 @@ class Clients:
         """
         self.name = name
         self.endpoint = endpoint
+        self._fileno = endpoint.fileno()
         self._welcome = welcome
         self._listening = ListeningTime(tick_time)
         self._signing = signing
@@ -160,6 +161,10 @@ class Clients:
         for client in self._clients.values():
             total += client.link.counters
         return total
+
+    def may_receive(self, readable: Collection[int]) -> bool:
+        """Return whether something may have arrived: which descriptors are readable."""
+        return bool(self._backlog) or self._fileno in readable or self.endpoint.is_polled
 
     def renew(self) -> None:
         """Begin another tick: what arrives may take its time again."""

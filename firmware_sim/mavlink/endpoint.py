@@ -69,6 +69,11 @@ class Endpoint(Protocol):
 class SharedEndpoint(Endpoint, Protocol):
     """An endpoint that tells its peers apart."""
 
+    @property
+    def is_polled(self) -> bool:
+        """Whether something may have arrived although its descriptor is not readable."""
+        ...
+
     def arrivals(self) -> Iterator[tuple[Peer, bytes]]:
         """Yield what has arrived and from whom, oldest first; a bounded number of chunks.
 
@@ -85,6 +90,7 @@ class MemoryEndpoint:
     """Two queues in one process: for lockstep and tests."""
 
     datagrams = True
+    is_polled = True
 
     def __init__(self) -> None:
         self.inbox: deque[bytes] = deque()
@@ -158,8 +164,12 @@ class UdpPeer:
 
     def send_streams(self, frames: Sequence[bytes]) -> None:
         """Send each frame as a datagram of its own, as PX4: some clients decode no other."""
+        send, address = self._socket.sendto, self._address
         for frame in frames:
-            self.send(frame)
+            try:
+                send(frame, address)
+            except OSError:
+                self.send_errors += 1
 
     def fileno(self) -> int | None:
         """Return None: the socket's owner waits for it."""
@@ -177,6 +187,7 @@ class UdpEndpoint:
     """
 
     datagrams = True
+    is_polled = False
 
     def __init__(
         self,

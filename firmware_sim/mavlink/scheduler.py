@@ -95,11 +95,6 @@ class StreamScheduler:
         self.fast_us = next_us
         self.wake_us = min(next_us, self._next_us)
 
-    def begin(self, now_us: int) -> None:
-        """Take simulated `now_us` [µs] for the time base, where that is asked for."""
-        if self._rebase_pending:
-            self._rebase(now_us)
-
     def next_slow_us(self, now_us: int) -> float:
         """Return when slow streams are sent next, at or after `now_us` [µs], but for quiet ones."""
         if self._rebase_pending:
@@ -119,7 +114,8 @@ class StreamScheduler:
     def due(self, now_us: int) -> list[str]:
         """Return the streams to send at `now_us` [µs] and plan their next time."""
         begins = self._rebase_pending  # the first heartbeat does not wait
-        self.begin(now_us)
+        if begins:
+            self._rebase(now_us)
         if now_us < self._next_us or not (begins or self.is_time(now_us)):
             return []
         plan, names = self._slow_due_us, []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import select
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import chain
@@ -128,6 +129,13 @@ class MavlinkServer:
         self._forwarder = Forwarder(self._all)
         self._traffic = TrafficLog(lambda: self._now_us)
         self._links = [self._open(config, link_id) for link_id, config in enumerate(links)]
+        self._arrivals = select.poll()
+        for number in self.filenos():
+            self._arrivals.register(number, select.POLLIN)
+        self._is_transferring = True
+        """Whether a client may get something piece by piece: lists, files, logs."""
+        self._mission_progress: object = None
+        """Of the newest `send` (`Plans.progress`)."""
         if port is not None:
             self.attach(port)
 
@@ -161,7 +169,10 @@ class MavlinkServer:
         """
         self._now_us = now_us
         effective = 0
+        readable = [number for number, _ in self._arrivals.poll(0)]
         for clients in self._links:
+            if not clients.may_receive(readable):
+                continue
             for client, message in clients.receive(now_us):
                 if self._dispatch(client, message):
                     effective += 1
@@ -204,7 +215,13 @@ class MavlinkServer:
         for event in port.take_events():
             self._events.add(event, now_us)
         everyone = list(self._all())
-        self._send_pending(everyone, now_us)
+        progress = port.plans.progress
+        if self._is_transferring or progress != self._mission_progress:
+            self._mission_progress = progress
+            self._send_pending(everyone, now_us)
+            self._is_transferring = any(
+                c.context is not None and c.context.is_busy for c in everyone
+            )
         due = [(client, client.due(now_us)) for client in everyone if client.wakes(now_us, texts)]
         if due:
             self._stream(due, flown, after_us, texts)
@@ -253,7 +270,8 @@ class MavlinkServer:
             if moved and link.scheduler.is_time(now_us):
                 client.announced_origin = origin
                 names = ["GPS_GLOBAL_ORIGIN", *names]
-            link.stream_due(names, state, payloads)
+            if names:
+                link.stream_due(names, state, payloads)
             link.flush()
 
     def _forget(self, now_us: int) -> None:
@@ -357,6 +375,7 @@ class MavlinkServer:
             calibration=self._calibration,
             radio=self._radio,
         )
+        self._is_transferring = True
         client.events = EventSender(self._events)
         client.announced_origin = None
 
@@ -381,6 +400,7 @@ class MavlinkServer:
         if source == (self._system_id, COMPONENT_ID) or context is None:
             return False
         context.now_us = self._now_us
+        self._is_transferring = True  # `send` looks whether it does
         client.hear(source)
         self._traffic.heard(client, message)
         kind = message.get_type()

@@ -30,6 +30,7 @@ class MemoryHub:
     """Implements `SharedEndpoint`."""
 
     datagrams = True
+    is_polled = True
 
     def __init__(self, most: int = 256) -> None:
         self.send_errors = 0

@@ -189,6 +189,11 @@ class Plans:
         self.receiving = False
         """Whether a list is being uploaded, on any link."""
 
+    @property
+    def progress(self) -> tuple[int, int, int, int]:
+        """How far the mission has come: current and reached item, newest DO_JUMP and its count."""
+        return self.current, self.reached, self.jumped, self.jumps_done.get(self.jumped, 0)
+
     def stored(self, kind: Kind) -> Stored:
         """Return a list."""
         return self._stored[kind]
