@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from airl_mav.arena.footprints import Boxes, Floats, draw_numbers, inner, segment_clear, with_room
 from airl_mav.arena.geometry import Arena, Bounds, Tour
 from airl_mav.arena.placement import draw_place
-from airl_mav.core.kernels import kernel
+from airl_mav.core.kernels import kernel, large_kernel
 from airl_mav.profiles.arena import MovingObstacles
 
 LEG_MIN_M = 1.0
@@ -127,7 +127,7 @@ def _walk_all(
     return points, counts, speeds
 
 
-@kernel
+@large_kernel
 def _walk(
     rng: np.random.Generator,
     start: Floats,
@@ -142,7 +142,7 @@ def _walk(
 ) -> Floats:
     """Return the way-points (k, 2) of a closed walk clear of the boxes, or `start` alone."""
     points = np.empty((64, 2))
-    points[0] = start
+    points[0, 0], points[0, 1] = start[0], start[1]
     count, elapsed, homing = 1, 0.0, 0
     while homing < HOMING_LEGS:
         here = points[count - 1]
@@ -225,12 +225,11 @@ def _timed(
     times, places = np.empty(len(points) * (1 + stops)), np.empty((len(points) * (1 + stops), 2))
     ends, first, at = np.empty(len(counts), np.int64), 0, 0
     for i in range(len(counts)):
-        times[at], places[at] = 0.0, points[first]
+        times[at], places[at, 0], places[at, 1] = 0.0, points[first, 0], points[first, 1]
         for k in range(first + 1, first + counts[i]):
-            times[at + 1], places[at + 1] = times[at] + legs[k - 1] / speeds[i], points[k]
-            at += 1
-            if stops:
-                times[at + 1], places[at + 1] = times[at] + dwell_s, points[k]
+            for stop in range(1 + stops):
+                times[at + 1] = times[at] + (dwell_s if stop else legs[k - 1] / speeds[i])
+                places[at + 1, 0], places[at + 1, 1] = points[k, 0], points[k, 1]
                 at += 1
         at, first = at + 1, first + counts[i]
         ends[i] = at

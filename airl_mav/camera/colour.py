@@ -20,7 +20,14 @@ from airl_mav.camera.gloss import Gloss, let_through
 from airl_mav.camera.mesh_triangles import Faces
 from airl_mav.camera.primitives import FLOOR, GROUND, OBSTACLE, SKY, Ids, Rectangles
 from airl_mav.camera.projection import MIN_DEPTH_M, Bent, Optics, Scene
-from airl_mav.camera.raycast import aim, blank, body_of, draw_bodies, invert
+from airl_mav.camera.raycast import (
+    aim,
+    blank,
+    body_of,
+    draw_bodies,
+    invert,
+    write_transposed,
+)
 from airl_mav.camera.reflections import draw_reflections
 from airl_mav.camera.shading import F32, ZERO, Canvas, Lit, Look, Packed, Plane, Points, Rays
 from airl_mav.camera.shadows import (
@@ -30,7 +37,7 @@ from airl_mav.camera.shadows import (
     shade_by_obstacle,
     shade_by_walls,
 )
-from airl_mav.core.kernels import borrowing_kernel, kernel
+from airl_mav.core.kernels import borrowing_kernel, large_kernel
 from airl_mav.vehicle.rotation import Quat, Vec
 
 U32 = np.uint32
@@ -76,7 +83,7 @@ class Work(NamedTuple):
         )
 
 
-@kernel
+@large_kernel
 def render_colour(
     rgb: NDArray[np.uint8],
     depth: Plane,
@@ -132,8 +139,8 @@ def render_colour(
     look = Look(texture, per_m, offset, albedo, gloss, light, atlas, pixel2)  # type: ignore[arg-type]
     _show(rgb, far, ids, rectangles, faces, work, optics, scene, meshes, look, gloss)
     if cylindrical:
-        depth[:, :] = far.T
-        seen[:, :] = ids.T
+        write_transposed(depth, far)
+        write_transposed(seen, ids)
 
 
 @borrowing_kernel

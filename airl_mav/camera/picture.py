@@ -18,6 +18,7 @@ from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.camera.lens_drops import rained_on
 from airl_mav.camera.projection import bent_of
 from airl_mav.camera.rays import finer
+from airl_mav.camera.render import pose_of
 from airl_mav.camera.textures import atlas, mean_of, periods
 from airl_mav.core.kernels import kernel
 from airl_mav.vehicle.rotation import Quat, Vec
@@ -80,9 +81,6 @@ def render_picture(
     """Return the picture of an arena, light times `gain`; arguments as of `render`."""
     k, obstacles, look = intrinsics, arena.obstacles, ColourArrays.of(arena.look)
     shape = (k.height, k.width)
-    # Tuples and arrays of the types that the batch twin hands over: one compiled kernel for both.
-    north, east, down = (float(part) for part in position)
-    q0, q1, q2, q3 = (float(part) for part in quaternion)
     lights = look.lights if gain == 1.0 else _brightened(look.lights, gain)
     picture = Picture(
         np.empty((*shape, 3), np.uint8), np.empty(shape, np.float32), np.empty(shape, np.int32)
@@ -90,8 +88,7 @@ def render_picture(
     render_colour(
         *picture,
         Work.of(k.width, k.height, k.cylindrical),
-        (north, east, down),
-        (q0, q1, q2, q3),
+        *pose_of(position, quaternion),
         float(k.focal),
         float(k.cx),
         float(k.cy),

@@ -19,6 +19,7 @@ float64: a float32 direction is off by millimetres on a floor seen at 20 m.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -211,6 +212,17 @@ def draw_bodies(
 
 
 @kernel
+def write_transposed(out: NDArray[Any], drawn: NDArray[Any]) -> None:
+    """Write an image (w, h) that was drawn by columns to `out` (h, w).
+
+    A slice assignment would also compile numba's error texts, for seconds at each place.
+    """
+    for u in range(drawn.shape[0]):
+        for v in range(drawn.shape[1]):
+            out[v, u] = drawn[u, v]
+
+
+@kernel
 def render_depth(
     out: Image,
     position: Vec | NDArray[np.float64],
@@ -262,4 +274,4 @@ def render_depth(
         return
     invert(drawn)
     if cylindrical:
-        out[:, :] = drawn.T
+        write_transposed(out, drawn)

@@ -78,6 +78,15 @@ def camera_pose(
     return (position[0] + x, position[1] + y, position[2] + z), multiply(q, tilt)
 
 
+def pose_of(
+    position: Vec | NDArray[np.float64], quaternion: Quat | NDArray[np.float64]
+) -> tuple[Vec, Quat]:
+    """Return a camera's pose as the batch twin hands it over: one compiled renderer for both."""
+    north, east, down = (float(part) for part in position)
+    w, x, y, z = (float(part) for part in quaternion)
+    return (north, east, down), (w, x, y, z)
+
+
 def render(
     arena: Arena,
     centers: NDArray[np.float64],
@@ -96,13 +105,10 @@ def render(
     image = np.empty((k.height, k.width), np.float32)
     render_depth(
         image,
-        position,
-        quaternion,
-        k.focal,
-        k.cx,
-        k.cy,
+        *pose_of(position, quaternion),
+        *(float(k.focal), float(k.cx), float(k.cy)),
         k.cylindrical,
-        max_range,
+        float(max_range),
         arena.bounds.as_array(),
         obstacles.shape,
         centers,

@@ -20,7 +20,6 @@ from airl_mav.camera import picture, render
 from airl_mav.camera.bvh import Meshes, forest_of, meshes_of, placed_in
 from airl_mav.camera.gloss import MATT, Gloss
 from airl_mav.camera.picture import ColourArrays
-from airl_mav.camera.raycast import render_depth
 
 _of = ColourArrays.of
 
@@ -39,18 +38,10 @@ def _arrays(look: Any) -> ColourArrays:
     return replace(arrays, gloss=arrays.gloss or matt)
 
 
-def _depth(image: Any, position: Any, quaternion: Any, *more: Any) -> None:
-    """Render a depth image from a pose of tuples, as the batch twin's cameras do."""
-    north, east, down = map(float, position)
-    w, x, y, z = map(float, quaternion)
-    render_depth(image, (north, east, down), (w, x, y, z), *more)
-
-
 @contextmanager
 def one_renderer(*, meshes: bool = True, gloss: bool = True) -> Iterator[None]:
     """Render all pictures and depth images meanwhile with meshes and glossy surfaces."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(render, "render_depth", _depth)
         for module in (picture, render) if meshes else ():
             patch.setattr(module, "meshes_of", _meshes)
         if gloss:

@@ -48,7 +48,7 @@ def deepest_corner(q: Quat, half: Vector) -> Vec:
 
 
 @kernel
-def _spread(a: Vector, b: Vector, c: Vector, d: Vector) -> float:
+def _spread(a: Vector | tuple[float, ...], b: Vector, c: Vector, d: Vector) -> float:
     """Return the square of the area that is spanned by a - b and c - d."""
     ax, ay, az = a[0] - b[0], a[1] - b[1], a[2] - b[2]
     bx, by, bz = c[0] - d[0], c[1] - d[1], c[2] - d[2]
@@ -58,7 +58,7 @@ def _spread(a: Vector, b: Vector, c: Vector, d: Vector) -> float:
 
 
 @kernel
-def _least_needed(new: Vector, deep: float, kept: Vector) -> int:
+def _least_needed(new: Vector | tuple[float, ...], deep: float, kept: Vector) -> int:
     """Return which of four points a new one replaces: the deepest stays, and the area is large."""
     stays, deepest = -1, deep
     for i in range(KEPT):
@@ -107,9 +107,7 @@ def touch_floor(
     height = -(p[2] + turned[2])
     n = many[0]
     if height < close:
-        new = np.array(
-            (corner[0], corner[1], corner[2], p[0] + turned[0], p[1] + turned[1], 0.0, height)
-        )
+        new = corner[0], corner[1], corner[2], p[0] + turned[0], p[1] + turned[1], 0.0, height
         at, nearest = -1, close * close
         for i in range(n):
             x, y, z = kept[i, 0] - new[0], kept[i, 1] - new[1], kept[i, 2] - new[2]
@@ -122,7 +120,8 @@ def touch_floor(
                 n += 1
             else:
                 at = _least_needed(new, height, kept)
-        kept[at] = new
+        for k in range(7):
+            kept[at, k] = new[k]
     for i in range(n):
         arm = rotate(q, (kept[i, 0], kept[i, 1], kept[i, 2]))
         kept[i, 6] = -(p[2] + arm[2] - kept[i, 5])
@@ -131,7 +130,8 @@ def touch_floor(
         x, y = kept[i, 3] - p[0] - arm[0], kept[i, 4] - p[1] - arm[1]
         if kept[i, 6] > close or x * x + y * y > close * close:
             n -= 1
-            kept[i] = kept[n]
+            for k in range(7):
+                kept[i, k] = kept[n, k]
     many[0] = n
     for i in range(n):
         arm = rotate(q, (kept[i, 0], kept[i, 1], kept[i, 2]))
