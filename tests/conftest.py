@@ -30,8 +30,15 @@ if find_spec("pybullet") is None:  # as on Python 3.12 and newer
     ]
     """They compare with pybullet."""
 
-RENDER_MESHES = {"tests/firmware/test_ground_contacts.py"}
-"""Modules for one worker, beside those of `one_renderer`: they need the same compiled kernels."""
+RENDER_MESHES = {
+    "tests/firmware/test_ground_contacts.py",
+    "tests/learning/test_fleet_glass.py",
+    "tests/learning/test_fleet_meshes.py",
+    "tests/learning/test_fleet_terrain.py",
+    "tests/unit/test_meshes_seen.py",
+    "tests/unit/test_terrain.py",
+}
+"""Modules for one worker: they need the same kernels, which no command compiles ahead."""
 
 # The first call of a kernel on a fresh machine compiles it: seconds, not a slow example.
 settings.register_profile("kernels", deadline=None)
@@ -65,8 +72,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.flaky(reruns=1))
         if not group:
             module = item.nodeid.partition("::")[0]
-            rendered = "one_renderer" in getattr(item, "fixturenames", ())
-            name = "meshes" if rendered or module in RENDER_MESHES else module
+            name = "meshes" if module in RENDER_MESHES else module
             item.add_marker(pytest.mark.xdist_group(name))
     order = sorted(range(len(items)), key=lambda index: not named[index])
     items[:] = [items[index] for index in order]
@@ -109,15 +115,6 @@ def _one_worker_unless_asked() -> Iterator[None]:
         patch.setattr("airl_mav.experiments.process_executor.usable_cores", lambda: 1)
         for module in (experiment, fly):
             patch.setattr(module, "open_executor", here)
-        yield
-
-
-@pytest.fixture(scope="module")
-def one_renderer() -> Iterator[None]:
-    """Render everything in a module with the same compiled kernels."""
-    from tests.support.one_renderer import one_renderer as shared
-
-    with shared():
         yield
 
 

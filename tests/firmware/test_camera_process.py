@@ -147,6 +147,7 @@ def test_one_process_serves_one_episode_after_the_other(process: CameraProcess) 
     the_same_in_place(fly(camera, 40_000, lambda seen: len(seen) == 2), 40_000)
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     "which",
     # In every run test_mitsuba.py traces fisheyes in its own process.
@@ -201,6 +202,7 @@ def test_it_gives_way_to_those_that_keep_time(process: CameraProcess) -> None:
     assert os.getsid(child().pid) == child().pid
 
 
+@pytest.mark.nightly
 def test_a_frame_has_the_images_of_all_cameras(process: CameraProcess) -> None:
     further = load_vehicle("quad-rig").cameras
     camera = process.camera(CAMERA, arena(), 0, None, 3, "raycast", further)

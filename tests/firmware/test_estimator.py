@@ -117,6 +117,7 @@ def unbiased(seconds: float, **changes: Any) -> Flight:
     return Flight(seconds, np.zeros(3), np.zeros(3), **changes)
 
 
+@pytest.mark.nightly
 def test_biases_are_found() -> None:
     accel_bias, gyro_bias = np.array([0.08, -0.05, 0.06]), np.array([0.004, -0.006, 0.005])
     estimator = Estimator(VALUE)

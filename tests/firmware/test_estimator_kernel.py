@@ -155,6 +155,7 @@ def bad_rest(sample: SensorSample) -> SensorSample:
     return sample
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("spoil", "rejected"),

@@ -400,6 +400,7 @@ def test_a_heading_of_its_own_frame_is_no_heading_of_the_globe() -> None:
     assert not math.isnan(rig.said("No valid global position estimate"))
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("kind", ["off", "stuck", "noise 5x", "bias 2,0,0m", "drift 0.3,0,0m/s"])
 def test_vision_that_fails_brings_no_vehicle_down_hard(kind: str) -> None:
     found = fly_fault(load_vehicle("quad-vio"), f"vision {kind}", "offboard", 1)

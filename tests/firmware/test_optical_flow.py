@@ -289,6 +289,7 @@ def test_what_repeats_itself_is_fused_a_few_times_and_zeros_always() -> None:
     assert rig.sim.time_us - (flow.fused_us or 0) <= 40_000
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     "case",
     [case for case in FITTED_CASES if case.fault.startswith("flow")],

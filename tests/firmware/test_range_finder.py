@@ -234,6 +234,7 @@ def test_ranges_that_stay_while_the_vehicle_climbs_are_given_up() -> None:
 # --- what is flown by it
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(("mode", "follows"), [(2, True), (0, False), (1, False)])
 def test_position_keeps_the_height_above_ground_while_it_stands(mode: int, follows: bool) -> None:
     """Ground that rises by 0.6 m in 6 s lifts the vehicle, where MPC_ALT_MODE says so."""
@@ -434,6 +435,7 @@ def test_a_client_s_rangefinder_tells_the_ground_and_another_direction_does_not(
 # --- failures
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     "case",
     [case for case in FITTED_CASES if case.fault.startswith("rangefinder")],

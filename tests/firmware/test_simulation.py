@@ -92,6 +92,7 @@ def test_a_seed_is_a_flight_whatever_else_was_flown_before() -> None:
     assert digest_of_a_flight(5) == first
 
 
+@pytest.mark.nightly
 def test_a_seed_is_a_flight_in_every_process() -> None:
     code = "from tests.firmware import test_simulation as t; print(t.digest_of_a_flight(5))"
     root = Path(__file__).parents[2]

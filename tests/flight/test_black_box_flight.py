@@ -155,6 +155,7 @@ def test_it_is_judged_as_a_rehearsal_is(recorded: Recorded, run: Run) -> None:
     assert straight_m - 0.5 < record.quality.distance_m < 1.5 * straight_m
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("told_a", [None, -1.0])
 def test_where_no_current_is_measured_there_is_no_energy(
     recorded: Recorded, run: Run, tmp_path: Path, told_a: float | None

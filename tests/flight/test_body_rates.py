@@ -158,6 +158,7 @@ def test_overdue_body_rates_are_replaced_by_a_stand(tmp_path: Path, seed: int) -
     assert math.degrees(max(tilts)) < 60.0
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("latency", "asked", "close"),
     [

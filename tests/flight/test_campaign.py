@@ -189,6 +189,7 @@ def children(parent: int) -> list[int]:
     return found
 
 
+@pytest.mark.nightly
 def test_a_job_that_loses_its_workers_ends_the_campaign_with_one_line(
     tmp_path: Path, reference: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

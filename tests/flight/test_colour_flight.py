@@ -128,6 +128,7 @@ def test_the_companion_gets_the_images_that_the_twin_renders(
     assert [len(each.earlier) for each in seen[:3]] == [0, 1, 2]
 
 
+@pytest.mark.nightly
 def test_a_flight_sees_what_is_path_traced(policy: Path, tmp_path: Path) -> None:
     """Close to the ray caster's, not the same; the same flight again sees the same again."""
     pytest.importorskip("mitsuba")
@@ -167,6 +168,7 @@ def test_where_nothing_is_path_traced_says_so(
     assert accepted in str(raised.value)
 
 
+@pytest.mark.nightly
 def test_what_was_path_traced_goes_onto_no_card(policy: Path) -> None:
     pytest.importorskip("mitsuba")
     words = ("--vehicle", "quad-rgb", "--level", "lockstep", "--renderer", "mitsuba", "--on-card")
@@ -203,6 +205,7 @@ jpeg_quality = 75
 """
 
 
+@pytest.mark.nightly
 def test_a_flight_sees_formed_images_as_jpeg_leaves_them(
     policy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

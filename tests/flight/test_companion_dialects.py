@@ -58,6 +58,7 @@ def test_kinds() -> None:
         assert dialect_of(other) is PX4
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.xdist_group("flight")
 def test_a_flight_on_ardupilot() -> None:

@@ -384,6 +384,7 @@ def test_the_page_says_what_is_modelled_and_shows_no_real_time(
     assert pictured <= {e.index for e in run_.episodes if e.outcome is not Outcome.SUCCESS}
 
 
+@pytest.mark.nightly
 def test_a_page_alone_loads_what_draws(tmp_path: Path) -> None:
     program = """
 import sys
@@ -402,6 +403,7 @@ print("loaded:", *sorted({"matplotlib", "jinja2"} & set(sys.modules)))
     assert loaded == ["", " jinja2 matplotlib"]
 
 
+@pytest.mark.nightly
 def test_a_long_table_is_cut_short_and_says_so(
     greedy: tuple[LoadedRun, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -557,6 +559,7 @@ def test_a_crash_between_arrays_and_lines_doubles_nothing(
     assert same_runs(load(out), reference)
 
 
+@pytest.mark.nightly
 def test_what_is_finished_is_shown_again_and_not_flown(
     greedy: tuple[LoadedRun, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -573,6 +576,7 @@ def test_what_is_finished_is_shown_again_and_not_flown(
     assert before == after
 
 
+@pytest.mark.nightly
 def test_a_page_says_what_was_required_last(
     greedy: tuple[LoadedRun, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -77,6 +77,7 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> tuple[LoadedRun, str]
 # --- what is flown
 
 
+@pytest.mark.nightly
 def test_one_worker_or_two_or_the_rehearsal_fly_the_same(
     reference: tuple[LoadedRun, str], tmp_path: Path
 ) -> None:

@@ -106,6 +106,7 @@ def test_own_body_rates(tmp_path: Path) -> None:
     assert "decisions 200 ms late: collision, collision\n" in text
 
 
+@pytest.mark.nightly
 def test_own_arena(tmp_path: Path) -> None:
     text = output_of("own_arena.py", tmp_path)
     (trunks,) = numbers_after(r"seed 7: (\d+) trunks", text)

@@ -232,6 +232,7 @@ entry.sitl()
 """airl-sitl whose report has no picture of a single flight."""
 
 
+@pytest.mark.nightly
 def test_interrupted_flight(tmp_path: Path, ground: Ground) -> None:
     ports = choose_ports(ground.port)
     with sitl(

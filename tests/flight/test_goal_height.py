@@ -115,6 +115,7 @@ def test_passing_below_the_goal_is_not_reaching_it(arena: Path) -> None:
     assert away.min() < 0.5 * RADIUS_M
 
 
+@pytest.mark.nightly
 def test_the_shipped_policy_flies_through_the_gates_at_both_levels() -> None:
     """Seed 1 has three gates. Where it crosses their planes, it is within their openings."""
     seed = 1

@@ -113,6 +113,7 @@ def test_an_environment_of_rehearsals_starts_in_a_hover() -> None:
     assert record.navigation_us - record.started_us < US_PER_S
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     "flights",
     [pytest.param(10, marks=pytest.mark.slow), pytest.param(100, marks=pytest.mark.nightly)],

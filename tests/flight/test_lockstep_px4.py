@@ -122,6 +122,7 @@ def scenario(px4: Path, instance: int, folder: Path, **changes: object) -> Scena
     )
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_a_flight_with_its_stand_in(tmp_path: Path, px4_instance: int) -> None:
     run = rehearse(

@@ -205,6 +205,7 @@ def fly_staged(stage: RemoteStage) -> dict[str, str]:
     return stage.lanes()
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("changes", "outcome"),
     [
@@ -284,6 +285,7 @@ def key(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.nightly
 def test_neither_lost_words_nor_a_key_change_the_flight(
     reference: Reference, tmp_path: Path, key: Path
 ) -> None:
@@ -318,6 +320,7 @@ def test_a_companion_without_the_key_can_be_interrupted(
     assert "Traceback" not in companion.text()
 
 
+@pytest.mark.nightly
 def test_companion_that_dies_ends_the_flight(
     reference: Reference, tmp_path: Path, key: Path
 ) -> None:

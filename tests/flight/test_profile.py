@@ -273,6 +273,7 @@ def test_light_installation_measures(tmp_path: Path) -> None:
     assert (tmp_path / "computers/pi.toml").exists()
 
 
+@pytest.mark.nightly
 def test_light_installation_has_help(tmp_path: Path) -> None:
     for words in ([], ["profile"], ["companion"], ["list"], ["train"]):
         done = in_light_install(tmp_path, *words, "--help")
@@ -321,6 +322,7 @@ def test_interrupted_profile_writes_nothing(tmp_path: Path) -> None:
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.nightly
 def test_an_interrupted_soak_keeps_what_was_measured(tmp_path: Path) -> None:
     words = [sys.executable, "-u", "-m", "airl_mav.cli.main", "profile", "--soak", "10min"]
     process = subprocess.Popen(
@@ -381,6 +383,7 @@ def test_power_that_the_computer_tells_is_its_watts(
     assert "price: " not in held.source
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.xdist_group("flight")
 def test_stages_in_flight(tmp_path: Path) -> None:

@@ -76,6 +76,7 @@ def other(tmp_path_factory: pytest.TempPathFactory) -> RecordedFlight:
     return OTHER.fly(tmp_path_factory.mktemp("other") / "flight")
 
 
+@pytest.mark.nightly
 def test_what_is_true_is_found(refitted: Refitted) -> None:
     truth, flight = refitted.truth, refitted.flight
     errors = errors_of(refitted.found, truth, true_dead_time_s(flight), flight)

@@ -282,6 +282,7 @@ if sys.argv[1] == "error":
 """A program that never closes its environment."""
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(("how", "status"), [("dropped", 0), ("error", 1)])
 def test_a_program_may_end_in_the_middle_of_a_flight(how: str, status: int) -> None:
     done = subprocess.run(
@@ -298,6 +299,7 @@ def test_a_program_may_end_in_the_middle_of_a_flight(how: str, status: int) -> N
 # --- PX4
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.parametrize("seeds", [(1,), pytest.param((1, 2), marks=pytest.mark.nightly)])
 def test_a_loop_with_px4_s_stand_in(

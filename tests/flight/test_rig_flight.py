@@ -197,6 +197,7 @@ def test_latency_is_not_compensated_for_it(policy: Path) -> None:
         scenario(policy, compensate=True)
 
 
+@pytest.mark.nightly
 def test_a_model_of_stable_baselines3_flies(tmp_path: Path) -> None:
     """Its own networks, of images as large as the cameras', exported like a configuration."""
     (tmp_path / "two.toml").write_text(

@@ -298,6 +298,7 @@ def test_injected_latency(tmp_path: Path) -> None:
     assert "as if Raspberry Pi 4" in (run.folder / "report.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.nightly
 def test_a_crash_is_judged_and_the_run_goes_on(tmp_path: Path) -> None:
     """A storm into the wall: the companion is called off, the next episode starts."""
     storm = ("--wind.east-m-s", "48", "--arena", str(write_arena(tmp_path, 30.0)))

@@ -117,6 +117,7 @@ def test_a_wrong_motor_order_is_found_on_the_ground(tmp_path: Path, px4_instance
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.nightly
 def test_px4_does_not_outlive_a_killed_rehearsal(tmp_path: Path, px4_instance: int) -> None:
     build = write_build(tmp_path / "px4")
     with running(px4(build, px4_instance), tmp_path) as process:

@@ -306,6 +306,7 @@ def within(seconds: float, look: Any) -> Any:
     raise AssertionError("not in time")
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.xdist_group("flight")
 @pytest.mark.timeout(300)
@@ -366,6 +367,7 @@ def silent(port: int) -> bool:
     return False
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 @pytest.mark.xdist_group("rehearsal")
 @pytest.mark.timeout(300)

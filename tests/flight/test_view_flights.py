@@ -101,6 +101,7 @@ def test_a_latency_by_hand_acts_and_is_on_record() -> None:
     assert record.sha256 is None
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_two_processes_show_their_flight_and_obey(tmp_path: Path) -> None:
     """Changed by hand, it is kept as it was flown: not flown again, and not valid."""

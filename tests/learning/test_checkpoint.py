@@ -109,6 +109,7 @@ def assert_same(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> None:
         np.testing.assert_array_equal(a[key], b[key], err_msg=key)
 
 
+@pytest.mark.nightly
 def test_a_run_goes_on_in_another_process_bit_for_bit(tmp_path: Path) -> None:
     """With DQN: test_training.py."""
     name = "ppo"

@@ -147,6 +147,7 @@ def test_the_expert_that_reads_depth_cannot_be_imitated() -> None:
     assert Expert("planner", navigation) is not None
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(("algorithm", "told"), [("RecurrentPPO", ()), ("PPO", ("command",))])
 def test_networks_of_colour_are_exported(
     algorithm: str, told: tuple[Told, ...], tmp_path: Path

@@ -263,6 +263,7 @@ class Endless(ToyFleet):
         return self._seen(), np.ones(self.num_envs, np.float32), done, infos
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("n_step", "dies"),
     [

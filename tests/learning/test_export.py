@@ -223,6 +223,7 @@ def test_the_card_tells_what_was_exported(tmp_path: Path) -> None:
     }
 
 
+@pytest.mark.nightly
 def test_exports_are_equal_and_name_no_path_of_this_machine(tmp_path: Path) -> None:
     first = export_tiny(tmp_path / "a", with_torch=True)
     second = export_tiny(tmp_path / "b")
@@ -246,6 +247,7 @@ def test_a_second_export_replaces_all_of_the_first(tmp_path: Path) -> None:
     assert load_card(tmp_path).name == "other"
 
 
+@pytest.mark.nightly
 def test_nothing_is_written_when_the_export_differs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -453,6 +455,7 @@ def test_a_foreign_zip_exports_with_one_command(
     assert printed.err == ""
 
 
+@pytest.mark.nightly
 def test_a_foreign_continuous_model_and_the_paper_layout(
     zips: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -507,6 +510,7 @@ def test_what_a_vec_normalize_did_becomes_part_of_the_network(
     compare(load_learned(tmp_path / "p").act_batch(seen), wanted)
 
 
+@pytest.mark.nightly
 def test_a_vec_normalize_of_rewards_alone_changes_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

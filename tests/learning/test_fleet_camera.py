@@ -24,8 +24,6 @@ from airl_mav.profiles.vehicle import load_vehicle
 from tests.support.lenses import OPENING
 from tests.support.poses import at_rest
 
-pytestmark = pytest.mark.usefixtures("one_renderer")
-
 N = 12
 CAMERA = Intrinsics.from_fov(64, 48, math.radians(87.0))
 PANORAMA = Intrinsics.of(load_vehicle("quad-panorama").camera)

@@ -20,8 +20,6 @@ from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from tests.learning.test_fleet_meshes import CAMERA, MOUNT, RANGE_M, scattered
 
-pytestmark = pytest.mark.usefixtures("one_renderer")
-
 SEEDS = range(4)
 
 

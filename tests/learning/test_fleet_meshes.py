@@ -27,8 +27,6 @@ from tests.support.command_line import airl
 from tests.support.lenses import BARREL
 from tests.support.poses import at_rest
 
-pytestmark = pytest.mark.usefixtures("one_renderer")
-
 MOUNT = Mount((0.1, 0.0, 0.02), 0.1)
 CAMERA = Intrinsics.from_fov(48, 32, 1.5)
 FISHEYE = Intrinsics.from_fov(48, 32, 2.8, "fisheye", distortion=BARREL)

@@ -30,8 +30,6 @@ from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from tests.support.poses import at_rest
 
-pytestmark = pytest.mark.usefixtures("one_renderer")
-
 MOUNT = Mount((0.1, 0.0, 0.02), 0.1)
 CAMERA = Intrinsics.from_fov(48, 32, 1.5)
 RANGE_M = 25.0

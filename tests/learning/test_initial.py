@@ -54,6 +54,7 @@ def test_begins_with_the_best_weights_of_a_run(before: Path, tmp_path: Path) -> 
     assert noted == str(before)
 
 
+@pytest.mark.nightly
 def test_ppo_goes_on_from_what_an_expert_has_taught(tmp_path: Path) -> None:
     """The mean of its actions is the pupil's; how widely it explores is its own."""
     environment = TINY["environment"] | {"actions": "velocity"}

@@ -360,6 +360,7 @@ def test_a_heat_map_writes_what_it_was_given_where_it_belongs() -> None:
     assert render_png(figure).startswith(b"\x89PNG")
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("computer", [None, "ras-pi-4"])
 def test_the_page_holds_every_cell_and_names_the_best_and_the_papers(
     tmp_path: Path, computer: str | None

@@ -101,6 +101,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.nightly
 def test_a_sweep_trains_judges_and_tells_all(undisturbed: Path) -> None:
     config = load_sweep(f"{undisturbed / 'small.toml'}")
     results = outcome(undisturbed)

@@ -152,6 +152,7 @@ def test_ctrl_c_says_how_to_go_on(short: Path, tmp_path: Path) -> None:
     assert "Traceback" not in output
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_programs_read_lines(short: Path, tmp_path: Path) -> None:
     config = tmp_path / "brief.toml"
@@ -202,6 +203,7 @@ def test_who_flies_well_by_chance_alone_is_told(in_training: float | None, told:
     assert notes == [f"      5,000 decisions      60 s  success  36.0%    2.40 s{told}"]
 
 
+@pytest.mark.nightly
 def test_folders_are_not_mixed_up(short: Path, straight: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="or resume"):
         airl("train", str(short), "--out", str(straight))

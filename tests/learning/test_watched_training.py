@@ -107,6 +107,7 @@ def weights(folder: Path) -> dict[str, str]:
     return found
 
 
+@pytest.mark.nightly
 def test_a_watched_training_learns_the_same(tmp_path: Path) -> None:
     """Bit for bit, while somebody looks at it as fast as it goes."""
     (tmp_path / "short.toml").write_text(SHORT, encoding="utf-8")

@@ -233,6 +233,7 @@ def test_the_page_is_whole_and_reaches_nothing_else(page: Path, compared: Compar
     assert not list(page.parent.glob("*.partial"))
 
 
+@pytest.mark.nightly
 def test_it_is_the_same_when_it_is_made_again(
     loaded: tuple[Comparison, dict[str, LoadedRun]], page: Path
 ) -> None:

@@ -450,6 +450,7 @@ def test_airl_report_shows_it_again(whole: tuple[Path, str]) -> None:
     assert again.strip() in text
 
 
+@pytest.mark.nightly
 def test_a_part_of_it_is_shown(whole: tuple[Path, str], tmp_path: Path, mitigated: str) -> None:
     """A gap that was stopped after its second column has one gap already."""
     real, flown = EpisodeSaver.add, []

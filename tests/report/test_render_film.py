@@ -104,6 +104,7 @@ def test_a_video_has_every_picture(folder: Path, tmp_path: Path, show: Shown) ->
         assert np.abs(off).mean() < 4.0
 
 
+@pytest.mark.nightly
 def test_a_flight_is_path_traced(folder: Path, tmp_path: Path) -> None:
     pytest.importorskip("mitsuba")
     words = ("--rate-hz", "1", "--width-px", "48", "--height-px", "32", "--samples", "16")

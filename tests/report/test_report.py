@@ -269,6 +269,7 @@ def test_every_picture_is_a_whole_png(page: str, demo: tuple[LoadedRun, dict[int
     assert not list(run.path.glob("*.partial"))
 
 
+@pytest.mark.nightly
 def test_the_same_run_gives_the_same_page(
     page: str, demo: tuple[LoadedRun, dict[int, Arena]], tmp_path: Path
 ) -> None:
@@ -477,6 +478,7 @@ def test_reported_json_config_is_readable(page: str) -> None:
     assert json.loads(block.replace("&#34;", '"'))["companion"] == {"hold_s": 0.5}
 
 
+@pytest.mark.nightly
 def test_a_run_in_which_nothing_arrived(
     demo: tuple[LoadedRun, dict[int, Arena]], tmp_path: Path
 ) -> None:

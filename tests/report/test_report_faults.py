@@ -89,6 +89,7 @@ def test_a_vehicle_that_cannot_hover_gets_one_line(run: Path, tmp_path: Path) ->
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.nightly
 def test_a_report_goes_where_it_is_asked_to_and_prints_nothing(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

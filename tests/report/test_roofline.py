@@ -75,6 +75,7 @@ def of(found: Roofline, name: str) -> RooflinePoint:
     return next(point for point in found.points if point.computer == name)
 
 
+@pytest.mark.nightly
 def test_the_model_is_the_closed_form_of_the_reaction_time(found: Roofline) -> None:
     heavy = of(found, "heavy")
     period_s = 1.0 / 30.0 + 0.005 + 0.011 + HOLD_S + 0.011 + 0.004 + 0.004

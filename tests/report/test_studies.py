@@ -193,6 +193,7 @@ def test_flights_to_one_goal_share_their_arena(degraded: tuple[Path, str]) -> No
     assert f"widest aside {np.mean(widest):.2f} " in line
 
 
+@pytest.mark.nightly
 def test_generalisation_is_told_from_home(tmp_path: Path) -> None:
     code, text = study(
         "generalisation",
@@ -293,6 +294,7 @@ def test_an_arena_twice_gets_one_line(tmp_path: Path) -> None:
         study("system", f'computer = "ras-pi-4"\n{arena}{arena}', tmp_path / "out")
 
 
+@pytest.mark.nightly
 def test_mitigation_is_the_gap_of_two_policies(tmp_path: Path) -> None:
     # Two policies that are there; which of them was trained for what is not under test.
     code, _ = study(
@@ -316,6 +318,7 @@ def test_mitigation_is_the_gap_of_two_policies(tmp_path: Path) -> None:
     assert not list((tmp_path / "out").glob("train-*"))
 
 
+@pytest.mark.nightly
 def test_ablation_zeroes_one_input_after_the_other(tmp_path: Path) -> None:
     code, text = study(
         "ablation",
@@ -336,6 +339,7 @@ def test_ablation_zeroes_one_input_after_the_other(tmp_path: Path) -> None:
     assert rows[1] == ["no-obstacles", "the", "paper", "91.0", "53.0", "42.0", "7.0"]
 
 
+@pytest.mark.nightly
 @pytest.mark.slow
 def test_the_held_out_zone_is_neither_learned_nor_mixed(tmp_path: Path) -> None:
     """Goals lie within and beyond the radius; the policy was trained with the former alone."""

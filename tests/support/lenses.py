@@ -7,10 +7,18 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from airl_mav.camera.intrinsics import Intrinsics
 from airl_mav.profiles.distortion import Distortion
+
+AT_NIGHT_THE_FISHEYE: list[Any] = [
+    "pinhole",
+    "cylindrical",
+    pytest.param("fisheye", marks=pytest.mark.nightly),
+]
+"""Projections, where a fisheye has a renderer of its own that compiles for half a minute."""
 
 BARREL: Distortion = (-0.05, 0.008, -0.0045, 0.0004)
 """Of a lens of more than 180 degrees, denser towards its edge; to 95 degrees from its axis."""

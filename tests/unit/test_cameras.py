@@ -32,8 +32,6 @@ from companion.cameras.driver import CameraThread, DepthImage
 from companion.cameras.fitting import Fitting, Lens, check_coverage
 from tests.support.lenses import BARREL, OPENING, rays_of_fisheye
 
-pytestmark = pytest.mark.usefixtures("one_renderer")
-
 WANTED = Intrinsics.from_fov(64, 48, math.radians(90.0))
 WIDE = Lens(848, 636, 424.0, 424.0, 423.5, 317.5)
 """Sees exactly what is wanted, in 13.25 times the pixels."""

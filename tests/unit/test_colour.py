@@ -22,11 +22,9 @@ from airl_mav.camera.textures import PERIOD, SIDE, atlas, pattern
 from airl_mav.core.frames import quat_from_euler, quat_to_matrix
 from airl_mav.profiles.appearance import DEFAULT, Appearance
 from airl_mav.profiles.arena import ArenaSpec
-from airl_mav.profiles.camera_kind import PROJECTIONS, Projection
+from airl_mav.profiles.camera_kind import Projection
 from airl_mav.profiles.loading import load_profile
-from tests.support.lenses import rays_of_fisheye
-
-pytestmark = pytest.mark.usefixtures("one_renderer")
+from tests.support.lenses import AT_NIGHT_THE_FISHEYE, rays_of_fisheye
 
 LEVEL = quat_from_euler(0.0, 0.0, 0.0)
 DOWN = quat_from_euler(0.0, -math.pi / 2, 0.0)
@@ -205,7 +203,7 @@ def camera_of(projection: Projection) -> Intrinsics:
     return Intrinsics.from_fov(64, 48, fov[projection], projection)
 
 
-@pytest.mark.parametrize("projection", PROJECTIONS)
+@pytest.mark.parametrize("projection", AT_NIGHT_THE_FISHEYE)
 def test_depth_is_that_of_the_depth_camera_to_the_bit(projection: Projection) -> None:
     k = camera_of(projection)
     for seed in range(3):
@@ -242,7 +240,7 @@ def surface_gap(o: Obstacles, i: int, p: NDArray[np.float64]) -> NDArray[np.floa
     return np.abs((np.abs(turned) - half).max(axis=1))
 
 
-@pytest.mark.parametrize("projection", PROJECTIONS)
+@pytest.mark.parametrize("projection", AT_NIGHT_THE_FISHEYE)
 def test_every_point_lies_on_what_the_segmentation_names(projection: Projection) -> None:
     k, named = camera_of(projection), 0
     for seed in range(3):
@@ -289,7 +287,7 @@ def hidden(o: Obstacles, i: int, p: NDArray[np.float64], s: NDArray[np.float64])
     return inside
 
 
-@pytest.mark.parametrize("projection", PROJECTIONS)
+@pytest.mark.parametrize("projection", AT_NIGHT_THE_FISHEYE)
 def test_every_floor_point_is_dark_where_a_way_to_the_sun_is_blocked(
     projection: Projection,
 ) -> None:

@@ -169,6 +169,7 @@ def test_each_worker_starts_once_and_no_more_start_than_there_are_jobs(tmp_path:
     assert len(list(tmp_path.glob("job-*"))) == 2
 
 
+@pytest.mark.nightly
 def test_a_worker_lives_on_over_the_runs_and_starts_each_anew(tmp_path: Path) -> None:
     with ProcessExecutor(1) as executor:
         ((_, (_, first)),) = executor.run([1], worker_jobs.doubles)
@@ -223,6 +224,7 @@ def test_the_job_of_a_lost_worker_is_given_to_another(tmp_path: Path, how: str, 
     assert lost == [f"a worker was lost by {name}: seed 3 begins again"] * 2
 
 
+@pytest.mark.nightly
 def test_a_job_that_loses_three_workers_ends_it_all(tmp_path: Path) -> None:
     start = partial(worker_jobs.dies, tmp_path, 3, "kill")
     done = []

@@ -103,6 +103,7 @@ def test_a_terminal_gets_a_bar(cache: Path) -> None:
     assert f"{LABEL}:" not in text
 
 
+@pytest.mark.nightly
 def test_an_interrupted_step_resumes(cache: Path) -> None:
     shown(until(cache, "small.left"))
     assert compiled(cache) == {"small.left"}
@@ -114,6 +115,7 @@ def test_an_interrupted_step_resumes(cache: Path) -> None:
     assert done.stat().st_mtime_ns == written
 
 
+@pytest.mark.nightly
 def test_a_changed_source_is_compiled_again_and_a_full_cache_is_silent(cache: Path) -> None:
     shown()
     (record,) = cache.glob("*.json")

@@ -30,8 +30,6 @@ from airl_mav.profiles.vehicle import load_vehicle
 from tests.support.lenses import BARREL, OPENING, published, rays_of_fisheye
 from tests.unit.test_colour import arena, busy, poses, sun
 
-pytestmark = pytest.mark.usefixtures("one_renderer")
-
 WIDE = Intrinsics(191, 191, 180.0 / math.pi, 95.0, 95.0, "fisheye")
 """A pixel a degree, in every direction."""
 
@@ -60,6 +58,7 @@ def ball(off_deg: float, plane_deg: float, distance: float, radius: float) -> Ar
     return Arena("ball", 0, Bounds(-500, 500, -500, 500, 0.001), (0, 0, 0), sphere, (), np.zeros(2))
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("off_deg", [0.0, 40.0, 89.0, 93.0])
 @pytest.mark.parametrize("plane_deg", [0.0, -50.0, -170.0])
 @pytest.mark.parametrize("distortion", [UNDISTORTED, BARREL, OPENING])
@@ -97,6 +96,7 @@ def test_points_fall_where_the_rays_begin() -> None:
     assert not np.isfinite(behind).any()
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("distortion", [UNDISTORTED, BARREL])
 def test_a_pixel_shows_what_a_pinhole_shows_that_looks_along_its_ray(
     distortion: Distortion,

@@ -27,8 +27,6 @@ from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.asset_files import ImageFile
 from airl_mav.profiles.loading import load_profile, profile_digest
 
-pytestmark = pytest.mark.usefixtures("one_renderer")
-
 PROFILE = """
 base = "dense-obstacles"
 description = "posters"

@@ -59,6 +59,7 @@ print(four(3.0), alone(3.0), *(k.__name__ for k in (alone, four) if k.stats.cach
 """
 
 
+@pytest.mark.nightly
 def test_an_edit_compiles_again_what_depends_on_it_and_no_more(tmp_path: Path) -> None:
     for name, text in FILES.items():
         file = tmp_path / name
@@ -171,6 +172,7 @@ for each in sys.argv[1:] or range(4):
 """
 
 
+@pytest.mark.nightly
 def test_processes_that_save_a_kernel_for_several_types_keep_all(tmp_path: Path) -> None:
     (tmp_path / "twofold.py").write_text(
         "from airl_mav.core.kernels import kernel\n\n@kernel\ndef twofold(x):\n    return x + x\n"

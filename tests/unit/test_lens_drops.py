@@ -24,8 +24,6 @@ from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from tests.learning.test_fleet_meshes import MOUNT, scattered
 
-pytestmark = pytest.mark.usefixtures("one_renderer")
-
 CAMERA = Intrinsics.from_fov(64, 48, 1.5)
 WET: dict[str, Any] = {"drops": [10, 30], "size": [0.05, 0.2], "streak": [1, 3]}
 
@@ -64,6 +62,7 @@ def test_rain_leaves_the_other_draws_alone() -> None:
     assert not len(dry.drops)
 
 
+@pytest.mark.nightly
 def test_what_is_the_same_everywhere_stays_so() -> None:
     for code in (0, 1, 37, 128, 255):
         rgb = np.full((48, 64, 3), code, np.uint8)

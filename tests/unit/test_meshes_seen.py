@@ -24,10 +24,8 @@ from airl_mav.core.frames import quat_from_euler, quat_to_matrix
 from airl_mav.profiles.appearance import Appearance
 from airl_mav.profiles.camera_kind import PROJECTIONS, Projection
 from airl_mav.profiles.distortion import UNDISTORTED, sees_to
-from tests.support.lenses import BARREL, ENDING, OPENING, rays_of_fisheye
+from tests.support.lenses import AT_NIGHT_THE_FISHEYE, BARREL, ENDING, OPENING, rays_of_fisheye
 from tests.support.meshes import ROOM, kept, ring, scene_of, triangles
-
-pytestmark = pytest.mark.usefixtures("one_renderer")
 
 Floats = NDArray[np.float64]
 
@@ -104,7 +102,7 @@ def pose_in(rng: np.random.Generator, arena: Arena) -> tuple[Floats, Floats]:
 
 
 @pytest.mark.timeout(600)  # compiles kernels, on a busy machine for minutes
-@pytest.mark.parametrize("projection", PROJECTIONS)
+@pytest.mark.parametrize("projection", AT_NIGHT_THE_FISHEYE)
 def test_depth_is_that_of_rays_in_float64(projection: Projection, tmp_path: Path) -> None:
     file = kept(triangles(ring()), tmp_path / "ring.npz")
     rng = np.random.default_rng(3)
@@ -158,6 +156,7 @@ def test_no_ray_passes_between_triangles(tmp_path: Path) -> None:
             np.testing.assert_allclose(seen, np.minimum(depth, floor.reshape(seen.shape)), 1e-6)
 
 
+@pytest.mark.nightly
 @pytest.mark.timeout(600)  # compiles kernels, on a busy machine for minutes
 @pytest.mark.parametrize("projection", PROJECTIONS)
 def test_a_mesh_of_a_box_is_the_box(projection: Projection, tmp_path: Path) -> None:
@@ -195,6 +194,7 @@ def test_a_mesh_of_a_box_is_the_box(projection: Projection, tmp_path: Path) -> N
     assert shaded > 1000
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("projection", ["pinhole", "fisheye"])
 def test_shadows_are_those_of_rays_in_float64(projection: Projection, tmp_path: Path) -> None:
     file = kept(triangles(ring()), tmp_path / "ring.npz")
@@ -253,6 +253,7 @@ def test_shadows_are_those_of_rays_in_float64(projection: Projection, tmp_path: 
     assert floor > 100
 
 
+@pytest.mark.nightly
 def test_a_ball_is_as_bright_as_the_cosine_law_says(tmp_path: Path) -> None:
     ball = trimesh.creation.icosphere(subdivisions=4, radius=1.0)
     file = kept(triangles(ball), tmp_path / "ball.npz")

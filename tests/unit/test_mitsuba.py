@@ -29,8 +29,6 @@ from airl_mav.profiles.loading import load_profile
 from tests.support.lenses import BARREL
 from tests.support.meshes import kept, ring, scene_of, triangles
 
-pytestmark = pytest.mark.usefixtures("one_renderer")
-
 pytest.importorskip("mitsuba")
 
 LIGHT: dict[str, Any] = {
@@ -177,6 +175,7 @@ def test_rooms_below_a_ceiling_are_within_three_percent(
     assert difference(scene, position, yaw, rays=4)[0] > 1.3 * inner
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("material", [pytest.param("plaster", marks=pytest.mark.nightly), "brick"])
 def test_meshes_are_theirs(material: str, tmp_path: Path) -> None:
     """Triangles with their shadows, and with bricks as they lie on them."""
@@ -204,6 +203,7 @@ SHINY: dict[str, dict[str, Any]] = {
 }
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("surface", list(SHINY))
 def test_what_is_mirrored_and_seen_through_glass_is_theirs(surface: str) -> None:
     """Every obstacle of one material; a matt one of its colour is farther off."""
@@ -229,16 +229,20 @@ def test_what_is_mirrored_and_seen_through_glass_is_theirs(surface: str) -> None
     assert off > 1.5 * apart, (off, apart)
 
 
-BENT = [
+FISHEYES = [
     Intrinsics.from_fov(72, 54, math.radians(170.0), "fisheye"),
     Intrinsics.from_fov(72, 60, math.radians(190.0), "fisheye", distortion=BARREL),
+]
+ALL_ROUND = [
     Intrinsics.from_fov(120, 40, 2.0 * math.pi, "cylindrical"),
     # Looks up and down as well: through all faces.
     Intrinsics.from_fov(60, 60, math.radians(200.0), "cylindrical"),
 ]
 
 
-@pytest.mark.parametrize("camera", BENT, ids=["fisheye", "distorted", "panorama", "high"])
+@pytest.mark.parametrize(
+    "camera", [*(pytest.param(each, marks=pytest.mark.nightly) for each in FISHEYES), *ALL_ROUND]
+)
 def test_cylinders_and_fisheyes_are_within_three_percent(camera: Intrinsics) -> None:
     """Resampled from the faces of a cube: what is not where it is would differ by shadows."""
     scene = arena("dense-obstacles", 3, **LIGHT, **PLAIN)
@@ -285,20 +289,21 @@ def test_the_same_seed_draws_the_same_bent_image() -> None:
     scene, place = arena("no-obstacles", 0, **LIGHT, **PLAIN), np.array([0.0, 0.0, -2.5])
     level = quat_from_euler(0.0, 0.0, 0.0)
     drawn = [
-        path_traced(scene, scene.centers_at(0), BENT[0], place, level, samples=4, seed=seed)
+        path_traced(scene, scene.centers_at(0), FISHEYES[0], place, level, samples=4, seed=seed)
         for seed in (5, 5, 6)
     ]
     np.testing.assert_array_equal(drawn[0], drawn[1])
     assert (drawn[0] != drawn[2]).any()
-    blind: Any = ~fisheye_rays(replace(BENT[1], width=90)).any(axis=0)
+    blind: Any = ~fisheye_rays(replace(FISHEYES[1], width=90)).any(axis=0)
     assert blind.any()
     shown = path_traced(
-        scene, scene.centers_at(0), replace(BENT[1], width=90), place, level, samples=4
+        scene, scene.centers_at(0), replace(FISHEYES[1], width=90), place, level, samples=4
     )
     assert not shown[blind].any()
     assert shown[~blind].any(axis=-1).mean() > 0.99
 
 
+@pytest.mark.nightly
 @pytest.mark.timeout(600)  # compiles kernels, on a busy machine for minutes
 @pytest.mark.parametrize("material", [pytest.param("earth", marks=pytest.mark.nightly), "grass"])
 def test_hills_are_theirs(material: str) -> None:

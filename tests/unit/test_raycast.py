@@ -28,8 +28,6 @@ from airl_mav.profiles.camera_kind import PROJECTIONS, Projection
 from airl_mav.profiles.distortion import UNDISTORTED, sees_to
 from tests.support.lenses import BARREL, ENDING, OPENING, rays_of_fisheye
 
-pytestmark = pytest.mark.usefixtures("one_renderer")
-
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 RIGHT_ANGLE = Intrinsics.from_fov(33, 25, math.pi / 2)  # odd: the centre pixel is the optical axis
 

@@ -22,8 +22,6 @@ from airl_mav.profiles.loading import load_profile
 from airl_mav.report.depth_colours import coloured
 from tests.support.lenses import BARREL
 
-pytestmark = pytest.mark.usefixtures("one_renderer")
-
 SMALL = ("--width-px", "64", "--height-px", "48")
 POSE = ("--north-m", "8", "--east-m", "-2", "--height-m", "3", "--yaw-deg", "20")
 
@@ -49,6 +47,7 @@ def sensor(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return picture.rgb, picture.depth_m, picture.seen
 
 
+@pytest.mark.nightly
 def test_a_fisheye_has_its_coefficients(tmp_path: Path) -> None:
     words = ("--projection", "fisheye", "--fov-deg", "160", "--samples", "1", *POSE, *SMALL)
     told = ("--distortion", "-0.05", "0.008", "-0.0045", "0.0004")

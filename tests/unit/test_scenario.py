@@ -132,6 +132,7 @@ assert not opened, opened
 """
 
 
+@pytest.mark.nightly
 def test_profiles_and_card_are_read_once_and_never_in_flight(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-c", READS],

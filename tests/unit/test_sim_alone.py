@@ -40,6 +40,7 @@ raise SystemExit(carry_out("airl degrade", "airl_mav.cli.degrade", words + more)
 """
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     ("program", "page"),
     [(FLY, "run/report.html"), (COMPARE, "run/degradation.html")],

@@ -32,10 +32,9 @@ from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.camera_kind import Projection
 from airl_mav.profiles.loading import load_profile
 from airl_mav.profiles.terrain import MOST_CELLS, Terrain
+from tests.support.lenses import AT_NIGHT_THE_FISHEYE
 from tests.support.meshes import kept, ring, scene_of, triangles
 from tests.unit.test_meshes_seen import in_world, nearest, rays_of
-
-pytestmark = pytest.mark.usefixtures("one_renderer")
 
 Floats = NDArray[np.float64]
 
@@ -287,7 +286,7 @@ def pose_in(rng: np.random.Generator, arena: Arena) -> tuple[Floats, Floats]:
 
 
 @pytest.mark.timeout(600)  # compiles kernels, on a busy machine for minutes
-@pytest.mark.parametrize("projection", ["pinhole", "cylindrical", "fisheye"])
+@pytest.mark.parametrize("projection", AT_NIGHT_THE_FISHEYE)
 def test_depth_of_hills_is_that_of_rays_in_float64(projection: Projection) -> None:
     rng = np.random.default_rng(4)
     pixels = 0
@@ -358,6 +357,7 @@ def test_meshes_on_hills_stand_as_high_as_their_place(tmp_path: Path) -> None:
     assert pixels > 20
 
 
+@pytest.mark.nightly
 def test_hills_are_ground_and_look_like_the_floor() -> None:
     arena = arena_of(3)
     k = Intrinsics.from_fov(120, 90, 1.4, kind="rgb")
@@ -374,6 +374,7 @@ def test_hills_are_ground_and_look_like_the_floor() -> None:
     assert green > red > blue
 
 
+@pytest.mark.nightly
 def test_the_pattern_of_the_floor_goes_on_over_ground_that_hardly_rises() -> None:
     arena = bare(arena_of(3))
     ground = ground_of(arena)
@@ -387,6 +388,7 @@ def test_the_pattern_of_the_floor_goes_on_over_ground_that_hardly_rises() -> Non
     assert same[one.seen == FLOOR].mean() > 0.99
 
 
+@pytest.mark.nightly
 def test_hills_throw_shadows_on_themselves_and_on_the_floor() -> None:
     sun = {"elevation_deg": [25, 25], "azimuth_deg": [90, 90], "irradiance": [0.8, 0.8]}
     spec = spec_of(appearance={"sun": sun, "floor": {"materials": ["plaster"]}})
