@@ -112,8 +112,8 @@ class WallPacing:
         """Wait until the wall time of simulated `tick_us`; return the time then [µs].
 
         What arrives early is handled at once, stamped with its own time, and waits for the tick; in
-        the last moments before it (`READ_AFTER_S`) it is left to be read then. One wait lasts until
-        the tick: to end one sooner costs as much processor time as the rest of a quiet tick.
+        the last moments before it (`READ_AFTER_S`) it is left to be read then. A quiet tick
+        has one wait: a second one costs as much processor time as all the rest of it.
         Every time handed out is read once and checked for lag first. A process that was stopped
         while it waited must not stamp what has arrived with a time that is about to be given up.
         """

@@ -114,8 +114,7 @@ class FlightRecorder:
         """Forget the path so far: the episode begins now."""
         self._trajectory = TrajectoryRecorder()
         self._estimates: list[Vector] = []
-        """Position, velocity, attitude: blocks (m, 10). They are as old as the samples of the
-        trajectory, less one tick: what the motors were told by."""
+        """Blocks (m, 10) of position, velocity, attitude at which the motors were commanded."""
         self._estimated_us: list[int] = []
         self._lateness_us: list[int] = []
         self._slips: list[tuple[int, int]] = []

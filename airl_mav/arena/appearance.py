@@ -41,7 +41,6 @@ class _Part(IntEnum):
     WALLS = 4
     STATIC = 5
     MOVING = 6
-    RAIN = 7
 
 
 @dataclass(frozen=True)
@@ -111,7 +110,6 @@ class Drawn:
 
     finish: Finish
     light: Light
-    drops: NDArray[np.float32]  # (k, 4) of rain on the lens, as of `lens_drops.draw_drops`
 
 
 def draw_appearance(
@@ -158,7 +156,7 @@ def draw_appearance(
         roughness,
         appearance.images,
     )
-    return Drawn(finish, _light(appearance, draw), _drops(appearance, draw))
+    return Drawn(finish, _light(appearance, draw))
 
 
 def _surfaces(
@@ -248,21 +246,6 @@ def _light(appearance: Appearance, draw: int) -> Light:
         horizon=scale * horizon,
         extinction=float(extinction),
     )
-
-
-def _drops(appearance: Appearance, draw: int) -> NDArray[np.float32]:
-    """Draw the drops of rain on the lens, drop by drop."""
-    rain = appearance.rain
-    least, most = rain.drops
-    if not most:
-        return np.zeros((0, 4), np.float32)
-    rng = stream(draw, Stream.APPEARANCE, _Part.RAIN)
-    wet, number = rng.random() < rain.share, rng.integers(least, most, endpoint=True)
-    draws = rng.random((int(number) if wet else 0, 4))
-    (narrow, wide), (round_, long) = rain.size, rain.streak
-    draws[:, 2] = narrow + (wide - narrow) * draws[:, 2]
-    draws[:, 3] = round_ + (long - round_) * draws[:, 3]
-    return draws.astype(np.float32)
 
 
 def linear_of(encoded: Floats) -> Floats:

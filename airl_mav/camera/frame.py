@@ -144,7 +144,7 @@ class FrameError(ValueError):
 
 @dataclass(frozen=True)
 class FurtherImage:
-    """What a further camera has taken at the same time; fields as those of `Frame`."""
+    """Image of an additional camera, taken at the same time; fields as in `Frame`."""
 
     image: NDArray[Any]
     intrinsics: Intrinsics

@@ -20,7 +20,6 @@ from airl_mav.camera.colour import RANGE_M
 from airl_mav.camera.cube_faces import FACES, Cube, cube_of, resampled, side_for
 from airl_mav.camera.gloss import GLASS, GLOSSY, INDEX, METAL, is_smooth
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.lens_drops import rained_on
 from airl_mav.camera.textures import mean_of, periods, texels
 from airl_mav.core.errors import UsageError
 from airl_mav.core.frames import quat_to_matrix
@@ -81,7 +80,6 @@ class PathTracer:
         else:
             light = self._resampled(mi, k, axes, position, seed)
         encoded: NDArray[np.uint8] = np.rint(255.0 * srgb_of(light)).astype(np.uint8)
-        rained_on(encoded, arena.look.drops)
         return encoded
 
     def _rendered(

@@ -15,7 +15,6 @@ from airl_mav.camera.bvh import meshes_of
 from airl_mav.camera.colour import Work, render_colour
 from airl_mav.camera.gloss import Gloss
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.lens_drops import rained_on
 from airl_mav.camera.projection import bent_of
 from airl_mav.camera.rays import finer
 from airl_mav.camera.render import pose_of
@@ -108,7 +107,6 @@ def render_picture(
         atlas(arena.look.finish.images),
         bent_of(k),
     )
-    rained_on(picture.rgb, arena.look.drops)
     return picture
 
 

@@ -30,7 +30,7 @@ def episodes(description: str, default: int, least: int = 1) -> Any:
 
 
 class ExperimentOptions(Telling, model.Flights, model.Lateness, model.Decisions, Aircraft):
-    """What all of them can be asked for; the level is that of the most flights a second."""
+    """Options that all experiments share; the default level is the fastest."""
 
     level: model.LevelName = Field(
         default="gym", description=model.Flights.model_fields["level"].description

@@ -12,9 +12,7 @@ from airl_mav.arena.appearance import OBSTACLE
 from airl_mav.arena.geometry import Arena
 from airl_mav.camera.colour import Work, render_colour
 from airl_mav.camera.gloss import MATT, Gloss
-from airl_mav.camera.image_sensor import LIGHT_OF
 from airl_mav.camera.intrinsics import Intrinsics
-from airl_mav.camera.lens_drops import draw_drops
 from airl_mav.camera.picture import ColourArrays, write_grey
 from airl_mav.camera.projection import Bent, bent_of
 from airl_mav.camera.render import Mount, camera_pose
@@ -52,13 +50,6 @@ def _all_matt(n: int, surfaces: int) -> GlossBatch:
     )
 
 
-class RainBatch(NamedTuple):
-    """The drops on the lenses in n arenas, padded to the most; see `camera.lens_drops`."""
-
-    present: NDArray[np.int64]  # (n,) number of them
-    drops: NDArray[np.float32]  # (n, k, 4)
-
-
 def _empty(n: int, surfaces: int) -> LookBatch:
     return LookBatch(
         np.zeros((n, surfaces), np.int8),
@@ -80,8 +71,6 @@ class Looks:
         """What the kernel looks at; replaced where an arena has more surfaces than all before."""
         self.gloss: GlossBatch | None = None
         """As `batch`; None: all surfaces have been matt, and nothing is spent on others."""
-        self.rain: RainBatch | None = None
-        """As `batch`; None: no lens has been wet, and nothing is spent on drops."""
         self.images: tuple[ImageFile, ...] = ()
         """Textures from files, of all arenas."""
 
@@ -120,20 +109,6 @@ class Looks:
         if self.gloss is not None and look.gloss is not None:
             for name, rows in look.gloss._asdict().items():
                 getattr(self.gloss, name)[i, :count] = rows
-        self._wet(i, arena.look.drops)
-
-    def _wet(self, i: int, drops: NDArray[np.float32]) -> None:
-        """Take the drops on slot i's lens."""
-        rain, n = self.rain, len(self.batch.texture)
-        if rain is None:
-            if not len(drops):
-                return
-            self.rain = rain = RainBatch(np.zeros(n, np.int64), np.zeros((n, 0, 4), np.float32))
-        if len(drops) > rain.drops.shape[1]:
-            larger = RainBatch(np.zeros(n, np.int64), np.zeros((n, len(drops), 4), np.float32))
-            copy_rows(rain, larger)
-            self.rain = rain = larger
-        rain.present[i], rain.drops[i, : len(drops)] = len(drops), drops
 
 
 class Lens(NamedTuple):
@@ -164,7 +139,6 @@ class Canvas(NamedTuple):
 
     work: Work
     rgb: NDArray[np.uint8]
-    dry: NDArray[np.uint8]
     depth: NDArray[np.float32]
     seen: NDArray[np.int32]
 
@@ -179,18 +153,18 @@ class ColourImages:
         k, shape = intrinsics, (intrinsics.height, intrinsics.width)
         self._lens = lens_of(k, math.inf)
         self._mount, self._looks, self._meshes = mount, looks, meshes
-        rgb, dry = np.zeros((2, *shape, 3), np.uint8)
+        rgb = np.zeros((*shape, 3), np.uint8)
         depth, seen = np.zeros(shape, np.float32), np.zeros(shape, np.int32)
         work = Work.of(k.width, k.height, k.cylindrical)
-        self._canvas = Canvas(work, rgb, dry, depth, seen)
+        self._canvas = Canvas(work, rgb, depth, seen)
 
     def render(
         self, fleet: Fleet | Seen, arenas: ArenaBatch, who: NDArray[np.bool_], out: NDArray[Any]
     ) -> None:
         """Write the images (n, h, w, 3), or (n, h, w, 1) in grey, of the vehicles in `who` (n,)."""
         looks, meshes = self._looks, self._meshes.batch
-        camera = (self._mount, self._lens, self._canvas, LIGHT_OF, atlas(looks.images))
-        _render(fleet, arenas, looks.batch, looks.gloss, looks.rain, meshes, who, *camera, out)
+        camera = (self._mount, self._lens, self._canvas, atlas(looks.images))
+        _render(fleet, arenas, looks.batch, looks.gloss, meshes, who, *camera, out)
 
 
 @kernel
@@ -207,13 +181,11 @@ def _render(
     arenas: ArenaBatch,
     looks: LookBatch,
     gloss: GlossBatch | None,
-    rain: RainBatch | None,
     meshes: MeshBatch | None,
     who: NDArray[np.bool_],
     mount: Mount,
     lens: Lens,
     canvas: Canvas,
-    light_of: NDArray[np.float32],
     patterns: NDArray[np.float32],
     out: NDArray[np.uint8],
 ) -> None:
@@ -230,9 +202,8 @@ def _render(
         count = arenas.n_obstacles[i]
         surfaces = OBSTACLE + count
         position, quaternion = camera_pose(fleet.position[i], fleet.quaternion[i], mount)
-        image = rgb if grey else out[i]
         render_colour(
-            image,
+            rgb if grey else out[i],
             canvas.depth,
             canvas.seen,
             canvas.work,
@@ -257,8 +228,6 @@ def _render(
             patterns,
             lens.bent,
         )
-        if rain is not None and rain.present[i] > 0:
-            draw_drops(image, canvas.dry, rain.drops[i, : rain.present[i]], light_of)
         if grey:
             pixels = rgb.shape[0] * rgb.shape[1]
             write_grey(out[i].reshape(pixels), rgb.reshape(pixels, 3))

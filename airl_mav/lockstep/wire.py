@@ -14,7 +14,7 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.core.signing import StoredSigning
 from airl_mav.lockstep.frames import datagrams, split
 from firmware_sim.mavlink.codec import Decoder, WireMessage, is_signed
-from firmware_sim.mavlink.endpoint import Endpoint, Peer, UdpEndpoint
+from firmware_sim.mavlink.endpoint import Peer, Sender, UdpEndpoint
 
 LONGEST_DATAGRAM = 1400
 """Frames of telemetry share a datagram up to this size [bytes]; MAVSDK reads 2048 at a time."""
@@ -69,7 +69,7 @@ class Wire:
         self._tell_us: int | None = None
         self._decoder = Decoder(datagrams=True)
         self._preset = endpoint.towards(None)
-        self._learned: tuple[Peer, Endpoint] | None = None
+        self._learned: tuple[Peer, Sender] | None = None
         self._known = stored is None
         """Whether anything has come that only a companion can have sent."""
         self._kept: tuple[Peer] | None = None

@@ -1,4 +1,4 @@
-"""What a network sees of the world: which layout, of which camera, told of what else."""
+"""Observations of a network: layout, camera, additional inputs."""
 
 from __future__ import annotations
 

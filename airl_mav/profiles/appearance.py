@@ -1,4 +1,4 @@
-"""What an arena looks like to a colour camera: materials, textures, sun, sky, fog, rain.
+"""What an arena looks like to a colour camera: materials, textures, sun, sky, fog.
 
 Every pair of numbers is [least, greatest], drawn uniformly for each seed. Colours are sRGB, 0-255.
 """
@@ -226,23 +226,6 @@ class Fog(ProfileModel):
         return self.share > 0.0 and self.extinction_1_m[1] > 0.0
 
 
-class Rain(ProfileModel):
-    """Drops of rain on the lens of a colour camera; they stay where they are for a flight."""
-
-    drops: Annotated[tuple[int, int], Each(0, 500, ascending=True)] = quantity(
-        "number of drops in the image", "1", default=(0, 0)
-    )
-    size: Annotated[tuple[float, float], Each(0.005, 0.5, ascending=True)] = quantity(
-        "width of each drop, as a share of the image's", "1", default=(0.02, 0.07)
-    )
-    streak: Annotated[tuple[float, float], Each(1, 20, ascending=True)] = quantity(
-        "height of each drop in its widths: 1 is round, more has run down", "1", default=(1.0, 3.0)
-    )
-    share: float = quantity(
-        "share of the drawn appearances that have drops at all", "1", ge=0, le=1, default=1.0
-    )
-
-
 class Appearance(ProfileModel):
     """What a colour camera sees. It has random streams of its own: the geometry knows none of it.
 
@@ -264,7 +247,6 @@ class Appearance(ProfileModel):
     sun: Sun = Field(default_factory=Sun, description="direct light")
     sky: Sky = Field(default_factory=Sky, description="what is above the walls, and diffuse light")
     fog: Fog = Field(default_factory=Fog, description="what hides far things")
-    rain: Rain = later_field(Rain, "drops on the lens")
 
     @model_validator(mode="after")
     def _materials_are_known(self) -> Appearance:

@@ -1,4 +1,4 @@
-"""One episode of a rehearsal: what is planned, what is known of it, what is kept of it."""
+"""One episode of a rehearsal: its plan, its observations, its record."""
 
 from __future__ import annotations
 

@@ -119,7 +119,7 @@ class Service:
         scenario: ResolvedScenario,
         tap: SimulationTap | None = None,
     ) -> None:
-        """Take what flies, whom to tell, what is flown, and what shows it to a view."""
+        """Store the firmware, its listeners, the scenario and the view."""
         self._tap = tap
         if tap is not None:
             firmware.on_frame = tap.frame

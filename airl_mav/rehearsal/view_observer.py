@@ -1,4 +1,4 @@
-"""What a view hears of a rehearsal: which flight it is, its phases, what is said."""
+"""Reports a rehearsal to a view: the flight, its phases, its texts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an export is asked for: the model of another trainer, and what its card says of it."""
+"""Options of `airl export`: the model of another trainer, and the fields of its card."""
 
 from __future__ import annotations
 

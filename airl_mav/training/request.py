@@ -1,4 +1,4 @@
-"""What a training is asked for: a configuration, and what changes in it."""
+"""Options of a training: a configuration, and changes to it."""
 
 from __future__ import annotations
 

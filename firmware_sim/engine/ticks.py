@@ -594,7 +594,7 @@ def estimate(c: Fields, sample: Fields) -> int:
         sample: Fields of the aircraft, whose samples are taken.
 
     Returns:
-        What is left for Python to fuse: bits of `measured`, and those of repeated samples.
+        Bits of the measurements that Python has to fuse, as in `measured`, and of repeated samples.
     """
     _take_inertial(c, sample)
     predict(c.state, c.covariance, c.process_noise, c.transition, c.gyro, c.accel, TICK_S)

@@ -17,7 +17,7 @@ from airl_mav.core.constants import TICK_US, US_PER_S
 from airl_mav.faults.kinds import Part
 from firmware_sim.faults.timeline import Acting, FaultTimeline
 from firmware_sim.mavlink.codec import dialect
-from firmware_sim.mavlink.endpoint import Endpoint, Peer, SharedEndpoint
+from firmware_sim.mavlink.endpoint import Peer, Sender, SharedEndpoint
 
 UP, DOWN = 0, 1
 """To the flight controller, and from it."""
@@ -111,21 +111,16 @@ class Lane(Generic[Frame]):
 
 
 class FailingSender:
-    """Sender to one peer over a failing link. Implements `endpoint.Endpoint`."""
+    """Sender to one peer over a failing link. Implements `endpoint.Sender`."""
 
-    def __init__(self, endpoint: Endpoint, clock: Clock, *, conducted: bool) -> None:
+    def __init__(self, endpoint: Sender, clock: Clock, *, conducted: bool) -> None:
         """Take the sender of a healthy link. Other arguments: as `FailingEndpoint`."""
-        self.datagrams = endpoint.datagrams
         self.lane: Lane[bytes] = Lane()
         """Towards the peer."""
         self._endpoint, self._clock, self._conducted = endpoint, clock, conducted
 
     send_errors = property(lambda self: self._endpoint.send_errors)
     """Chunks that could not be sent."""
-
-    def receive(self) -> list[bytes]:
-        """Return nothing: `FailingEndpoint.arrivals` has it."""
-        return []
 
     def send(self, data: bytes) -> None:
         """Send one frame: an answer."""
@@ -147,14 +142,6 @@ class FailingSender:
         if arrived := list(lane.arrived(now_us)):
             self._endpoint.send_streams(arrived)
 
-    def fileno(self) -> int | None:
-        """Return the descriptor to wait on, or None when there is none."""
-        return self._endpoint.fileno()
-
-    def close(self) -> None:
-        """Release the resources."""
-        self._endpoint.close()
-
 
 class FailingEndpoint(FailingSender):
     """An endpoint behind a failing link. Implements `endpoint.SharedEndpoint`."""
@@ -167,7 +154,8 @@ class FailingEndpoint(FailingSender):
         and telemetry. Frames arrive with a tick, so that the flight is the same every time.
         """
         super().__init__(endpoint, clock, conducted=conducted)
-        self._shared = endpoint
+        self._shared, self.datagrams = endpoint, endpoint.datagrams
+        self.fileno, self.close = endpoint.fileno, endpoint.close
         self._timeline: FaultTimeline | None = None
         self._up: Lane[tuple[Peer, bytes]] = Lane()
         self._senders: WeakValueDictionary[int, FailingSender] = WeakValueDictionary({0: self})
@@ -214,8 +202,8 @@ class FailingEndpoint(FailingSender):
         if not self._conducted or now_us % TICK_US == 0:
             yield from lane.arrived(now_us)
 
-    def towards(self, peer: Peer) -> Endpoint | None:
-        """Return an endpoint that sends to one peer; None for a preset remote that is not set."""
+    def towards(self, peer: Peer) -> Sender | None:
+        """Return what sends to one peer; None for a preset remote that is not set."""
         healthy = self._shared.towards(peer)
         if healthy is None:
             return None

@@ -16,14 +16,13 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Geodetic
 from airl_mav.core.signing import Signing
 from firmware_sim.autopilot.autopilot_state import Message
-from firmware_sim.mavlink.allowance import Allowance
 from firmware_sim.mavlink.codec import Decoder, WireMessage, is_signed
-from firmware_sim.mavlink.endpoint import Endpoint, Peer, SharedEndpoint
+from firmware_sim.mavlink.endpoint import Peer, Sender, SharedEndpoint
 from firmware_sim.mavlink.event_buffer import EventSender
+from firmware_sim.mavlink.limits import Allowance, ListeningTime, TickTime
 from firmware_sim.mavlink.link import Link, LinkCounters
 from firmware_sim.mavlink.services.context import Context
 from firmware_sim.mavlink.texts import TextEncoder
-from firmware_sim.mavlink.tick_time import ListeningTime, TickTime
 
 MAX_CLIENTS = 32
 """Clients of a link at a time, the preset remote not counted."""
@@ -113,7 +112,7 @@ class Clients:
         self,
         name: str,
         endpoint: SharedEndpoint,
-        welcome: Callable[[Peer, Endpoint], Client],
+        welcome: Callable[[Peer, Sender], Client],
         tick_time: TickTime,
         signing: Signing | None = None,
     ) -> None:

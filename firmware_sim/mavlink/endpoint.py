@@ -34,19 +34,12 @@ class PortTakenError(UsageError):
     """A port that another program has bound."""
 
 
-class Endpoint(Protocol):
-    """One end of a MAVLink link. Nothing blocks and nothing raises while flying."""
-
-    datagrams: bool
-    """True when each chunk from `receive` holds whole frames."""
+class Sender(Protocol):
+    """Sends to one other end of a MAVLink link. Nothing blocks and nothing raises while flying."""
 
     @property
     def send_errors(self) -> int:
         """Chunks that could not be sent."""
-        ...
-
-    def receive(self) -> list[bytes]:
-        """Return all chunks that have arrived, oldest first."""
         ...
 
     def send(self, data: bytes) -> None:
@@ -55,6 +48,17 @@ class Endpoint(Protocol):
 
     def send_streams(self, frames: Sequence[bytes]) -> None:
         """Send the telemetry of one tick, one frame after the other."""
+        ...
+
+
+class Endpoint(Sender, Protocol):
+    """One end of a MAVLink link, which receives as well."""
+
+    datagrams: bool
+    """True when each chunk from `receive` holds whole frames."""
+
+    def receive(self) -> list[bytes]:
+        """Return all chunks that have arrived, oldest first."""
         ...
 
     def fileno(self) -> int | None:
@@ -81,8 +85,8 @@ class SharedEndpoint(Endpoint, Protocol):
         """
         ...
 
-    def towards(self, peer: Peer) -> Endpoint | None:
-        """Return an endpoint that sends to one peer; None for a preset remote that is not set."""
+    def towards(self, peer: Peer) -> Sender | None:
+        """Return what sends to one peer; None for a preset remote that is not set."""
         ...
 
 
@@ -113,7 +117,7 @@ class MemoryEndpoint:
         while inbox:
             yield None, inbox.popleft()
 
-    def towards(self, peer: Peer) -> Endpoint | None:
+    def towards(self, peer: Peer) -> Sender | None:
         """Return this endpoint: there is one other end."""
         return self if peer is None else None
 
@@ -142,18 +146,12 @@ class MemoryEndpoint:
 
 
 class UdpPeer:
-    """One address that a bound UDP socket sends to. Receives nothing by itself."""
-
-    datagrams = True
+    """One address that a bound UDP socket sends to. Implements `Sender`."""
 
     def __init__(self, bound: socket.socket, address: Address) -> None:
         self.send_errors = 0
         self._socket = bound
         self._address = address
-
-    def receive(self) -> list[bytes]:
-        """Return nothing: the socket's owner sorts what arrives."""
-        return []
 
     def send(self, data: bytes) -> None:
         """Send one frame."""
@@ -170,12 +168,6 @@ class UdpPeer:
                 send(frame, address)
             except OSError:
                 self.send_errors += 1
-
-    def fileno(self) -> int | None:
-        """Return None: the socket's owner waits for it."""
-
-    def close(self) -> None:
-        """Do nothing: the socket is its owner's."""
 
 
 class UdpEndpoint:
@@ -263,8 +255,8 @@ class UdpEndpoint:
                 continue  # an earlier send was refused (ICMP): nothing arrived
             yield (None if address == self._remote else address), data
 
-    def towards(self, peer: Peer) -> Endpoint | None:
-        """Return an endpoint that sends to one address; None: to the preset remote."""
+    def towards(self, peer: Peer) -> Sender | None:
+        """Return what sends to one address; None: to the preset remote."""
         address = self._remote if peer is None else peer
         return None if address is None else UdpPeer(self._socket, address)
 

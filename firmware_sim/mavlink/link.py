@@ -20,7 +20,7 @@ from firmware_sim.mavlink.codec import (
     layout,
     trimmed,
 )
-from firmware_sim.mavlink.endpoint import Endpoint, SharedEndpoint
+from firmware_sim.mavlink.endpoint import Sender, SharedEndpoint
 from firmware_sim.mavlink.rates import GCS_HZ, GIMBAL_HZ, ONBOARD_HZ, PAYLOAD_HZ, interval_us
 from firmware_sim.mavlink.scheduler import StreamScheduler
 from firmware_sim.mavlink.streams import Builder
@@ -117,7 +117,7 @@ class Link:
         builders: Mapping[str, Builder | None],
         replies: Mapping[str, Builder | None] | None = None,
         *,
-        endpoint: Endpoint | None = None,
+        endpoint: Sender | None = None,
         system_id: int = SYSTEM_ID,
         signing: Signing | None = None,
         link_id: int = 0,
@@ -140,7 +140,7 @@ class Link:
         self.tap: Callable[[Sequence[bytes]], None] | None = None
         """Called with the frames of both directions, if set."""
         self.ignored = 0
-        self.endpoint = config.endpoint if endpoint is None else endpoint
+        self.endpoint: Sender = config.endpoint if endpoint is None else endpoint
         self._streams = {
             name: (layout(name), builder)
             for name, builder in builders.items()
@@ -178,13 +178,6 @@ class Link:
         """Send as another system from now on."""
         self._stream_encoder.identify(system_id)
         self._reply_encoder.identify(system_id)
-
-    def receive(self) -> list[WireMessage]:
-        """Return the messages that have arrived, oldest first."""
-        messages: list[WireMessage] = []
-        for chunk in self.endpoint.receive():
-            messages += self.decode(chunk)
-        return messages
 
     def decode(self, chunk: bytes) -> list[WireMessage]:
         """Return the messages in a chunk of bytes from this client."""

@@ -15,13 +15,12 @@ from firmware_sim.autopilot.autopilot_state import Message
 from firmware_sim.autopilot.port import AutopilotPort
 from firmware_sim.engine.record import Record
 from firmware_sim.interfaces import Truth
-from firmware_sim.mavlink.allowance import Allowance
 from firmware_sim.mavlink.clients import Client, Clients
 from firmware_sim.mavlink.codec import COMPONENT_ID, SYSTEM_ID, WireMessage
-from firmware_sim.mavlink.complaints import Complaints
-from firmware_sim.mavlink.endpoint import Endpoint, Peer
+from firmware_sim.mavlink.endpoint import Peer, Sender
 from firmware_sim.mavlink.event_buffer import EventBuffer, EventSender
 from firmware_sim.mavlink.forwarding import Forwarder
+from firmware_sim.mavlink.limits import Allowance, Complaints, TickTime
 from firmware_sim.mavlink.link import Link, LinkConfig, LinkCounters, Payloads
 from firmware_sim.mavlink.own_streams import OwnStreams
 from firmware_sim.mavlink.radio import Radio
@@ -33,7 +32,6 @@ from firmware_sim.mavlink.streams import BUILDERS, Builder
 from firmware_sim.mavlink.streams.status import system_time
 from firmware_sim.mavlink.telemetry import TickContext, flown_of
 from firmware_sim.mavlink.texts import REPLY_IDS, TextEncoder
-from firmware_sim.mavlink.tick_time import TickTime
 from firmware_sim.mavlink.tlog import TlogWriter
 from firmware_sim.mavlink.traffic_log import TrafficLog
 from firmware_sim.storage import Storage
@@ -135,7 +133,6 @@ class MavlinkServer:
         self._is_transferring = True
         """Whether a client may get something piece by piece: lists, files, logs."""
         self._mission_progress: object = None
-        """Of the newest `send` (`Plans.progress`)."""
         if port is not None:
             self.attach(port)
 
@@ -279,7 +276,8 @@ class MavlinkServer:
         self._forget_us = now_us + FORGET_EVERY_US
         for clients in self._links:
             clients.forget_silent(now_us)
-            for text in self._complaints.due(clients.name, clients.counters, now_us):
+            count = clients.counters
+            for text in self._complaints.due(clients.name, count.refused, count.dropped, now_us):
                 _tell(clients, text)
         if self._stored is not None:
             self._stored.save_due()
@@ -336,7 +334,7 @@ class MavlinkServer:
         self._storage.close()
 
     def _open(self, config: LinkConfig, link_id: int) -> Clients:
-        def welcome(peer: Peer, endpoint: Endpoint) -> Client:
+        def welcome(peer: Peer, endpoint: Sender) -> Client:
             builders = self._link_builders()
             # A requested PING must not advance the sequence of those that are streamed.
             replies = self._link_builders() if config.separate_replies else builders

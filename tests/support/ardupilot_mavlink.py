@@ -61,6 +61,7 @@ class Manners:
             "EXTENDED_SYS_STATE": lambda state: (3, _LANDED[state.status.landed]),
             "AUTOPILOT_VERSION": _version,
         }
+        self._endpoints = endpoints
         self._links = [
             Link(LinkConfig(f"serial{n}", endpoint, _RATES_HZ), builders)
             for n, endpoint in enumerate(endpoints)
@@ -76,9 +77,10 @@ class Manners:
         copter = self.copter
         if copter.inner.sample is None:
             return
-        for link in self._links:
-            for message in link.receive():
-                self._take(message, link)
+        for link, endpoint in zip(self._links, self._endpoints, strict=True):
+            for chunk in endpoint.receive():
+                for message in link.decode(chunk):
+                    self._take(message, link)
             due, state = link.scheduler.due(copter.time_us), copter.inner.state()
             flown, context = flown_of(state), TickContext().of(state)
             healthy = int(context[PARTS + 2])
@@ -94,8 +96,8 @@ class Manners:
             link.flush()
 
     def close(self) -> None:
-        for link in self._links:
-            link.endpoint.close()
+        for endpoint in self._endpoints:
+            endpoint.close()
 
     def _say(self, severity: int, text: str) -> None:
         for link in self._links:

@@ -26,7 +26,7 @@ EXTERNAL_MODES = 0xFF << 23
 """Eight modes that programs beside the autopilot may add: there are none."""
 
 REPORT_US = 2 * US_PER_S
-"""What has changed is told no more often than that [µs] (PX4's reporting interval)."""
+"""Shortest time between two reports of changes [µs] (PX4's reporting interval)."""
 
 MAX_CHECKS = 14
 """PX4 tells no more checks in one report."""

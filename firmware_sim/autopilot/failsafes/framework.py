@@ -120,7 +120,7 @@ def update(
     Args:
         state: As the last update left it; a new one after boot.
         time_us: Simulated time, never less than at the last update [µs].
-        vehicle: What flies, and what the user wants.
+        vehicle: State of the vehicle, and the mode that the user wants.
         conditions: What is wrong now.
         settings: The parameters.
         intervention: What the user did since the last update.

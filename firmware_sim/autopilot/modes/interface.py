@@ -1,4 +1,4 @@
-"""What a flight mode is, and what all modes share."""
+"""The interface of a flight mode, and the state that all modes share."""
 
 from __future__ import annotations
 
