@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 
 from firmware_sim.mavlink.codec import layout
-from firmware_sim.mavlink.rates import ONBOARD_HZ
+from firmware_sim.mavlink.scheduler import ONBOARD_HZ
 
 _OVERHEAD = 12
 """Header and checksum of a frame that is not signed [bytes]."""

@@ -519,10 +519,6 @@ class BuiltinAutopilot:
         """Set the horizontal speed of the present automatic mode [m/s]."""
         self._guidance.context.travel.speed_m_s = speed_m_s
 
-    def set_home_here(self) -> Result:
-        """Make the present position home."""
-        return self.set_home(None)
-
     def start_mission(self, index: int) -> Result:
         """Arm and fly the mission from an item on (MAV_CMD_MISSION_START); -1 = as it stands."""
         if not self._navigator.mission_is_valid(self._situation()):

@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba.extending import register_jitable
 
 from airl_mav.control.cascade import (
     Filters,
@@ -117,12 +116,6 @@ d innovation / d phi = (-tan(dip) cos(declination), -tan(dip) sin(declination), 
 _HOME_M = HOME.altitude_m
 _ATTITUDE, _RATES, _VELOCITY, _THRUST = 0, 4, 7, 10
 """Layout of `output`."""
-
-register_jitable(geodetic_to_local)
-register_jitable(local_to_geodetic)
-register_jitable(atmosphere.pressure_hpa)
-register_jitable(atmosphere.altitude_m)
-register_jitable(atmosphere.temperature_c)
 
 
 # --- control

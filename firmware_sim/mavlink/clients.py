@@ -8,7 +8,7 @@ another.
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 
@@ -16,13 +16,12 @@ from airl_mav.core.constants import US_PER_S
 from airl_mav.core.frames import Geodetic
 from airl_mav.core.signing import Signing
 from firmware_sim.autopilot.autopilot_state import Message
-from firmware_sim.mavlink.codec import Decoder, WireMessage, is_signed
+from firmware_sim.mavlink.codec import Decoder, TextEncoder, WireMessage, dialect, is_signed
 from firmware_sim.mavlink.endpoint import Peer, Sender, SharedEndpoint
 from firmware_sim.mavlink.event_buffer import EventSender
 from firmware_sim.mavlink.limits import Allowance, ListeningTime, TickTime
 from firmware_sim.mavlink.link import Link, LinkCounters
 from firmware_sim.mavlink.services.context import Context
-from firmware_sim.mavlink.texts import TextEncoder
 
 MAX_CLIENTS = 32
 """Clients of a link at a time, the preset remote not counted."""
@@ -265,3 +264,57 @@ class Clients:
             return False
         self.forget_silent(now_us, silent_us)
         return True
+
+
+COMMANDS = frozenset(
+    (
+        "COMMAND_LONG",
+        "COMMAND_INT",
+        "SET_MODE",
+        "SET_POSITION_TARGET_LOCAL_NED",
+        "SET_POSITION_TARGET_GLOBAL_INT",
+        "SET_ATTITUDE_TARGET",
+        "MANUAL_CONTROL",
+        "RC_CHANNELS_OVERRIDE",
+        "MISSION_COUNT",
+        "MISSION_CLEAR_ALL",
+        "MISSION_SET_CURRENT",
+        "PARAM_SET",
+        "SETUP_SIGNING",
+    )
+)
+"""Messages that change what the vehicle does."""
+
+ANNOUNCED = (dialect.MAV_TYPE_GCS, dialect.MAV_TYPE_ONBOARD_CONTROLLER)
+"""Types in the heartbeat of a ground station and of a companion computer."""
+
+
+class Senders:
+    """Notes who commands, and whose heartbeat calls them a companion or a ground station."""
+
+    def __init__(self) -> None:
+        self._announced: set[tuple[int, int]] = set()
+        """System and component ids. They hold for as long as the links are open."""
+        self._commands: Counter[tuple[int, int, str]] = Counter()
+
+    def note(self, message: WireMessage, kind: str, source: tuple[int, int]) -> None:
+        """Take a message of a sender that was for this vehicle and did something."""
+        if kind in COMMANDS:
+            self._commands[(*source, kind)] += 1
+        elif kind == "HEARTBEAT" and message.type in ANNOUNCED:
+            self._announced.add(source)
+
+    def strangers(self) -> tuple[str, ...]:
+        """Return a line for each stranger and kind of message since the last `forget`.
+
+        A stranger has not announced itself by now: MAVSDK commands before its first heartbeat.
+        """
+        return tuple(
+            f"system {system} component {component}, {kind} ({count} times)"
+            for (system, component, kind), count in sorted(self._commands.items())
+            if (system, component) not in self._announced
+        )
+
+    def forget(self) -> None:
+        """Begin anew: another episode."""
+        self._commands.clear()

@@ -21,8 +21,14 @@ from firmware_sim.mavlink.codec import (
     trimmed,
 )
 from firmware_sim.mavlink.endpoint import Sender, SharedEndpoint
-from firmware_sim.mavlink.rates import GCS_HZ, GIMBAL_HZ, ONBOARD_HZ, PAYLOAD_HZ, interval_us
-from firmware_sim.mavlink.scheduler import StreamScheduler
+from firmware_sim.mavlink.scheduler import (
+    GCS_HZ,
+    GIMBAL_HZ,
+    ONBOARD_HZ,
+    PAYLOAD_HZ,
+    StreamScheduler,
+    interval_us,
+)
 from firmware_sim.mavlink.streams import Builder
 from firmware_sim.mavlink.telemetry import NUMBERS, Packer
 from firmware_sim.mavlink.telemetry import payload as fast_payload

@@ -15,25 +15,21 @@ from firmware_sim.autopilot.autopilot_state import Message
 from firmware_sim.autopilot.port import AutopilotPort
 from firmware_sim.engine.record import Record
 from firmware_sim.interfaces import Truth
-from firmware_sim.mavlink.clients import Client, Clients
-from firmware_sim.mavlink.codec import COMPONENT_ID, SYSTEM_ID, WireMessage
+from firmware_sim.mavlink.clients import Client, Clients, Senders
+from firmware_sim.mavlink.codec import COMPONENT_ID, REPLY_IDS, SYSTEM_ID, TextEncoder, WireMessage
 from firmware_sim.mavlink.endpoint import Peer, Sender
 from firmware_sim.mavlink.event_buffer import EventBuffer, EventSender
 from firmware_sim.mavlink.forwarding import Forwarder
 from firmware_sim.mavlink.limits import Allowance, Complaints, TickTime
 from firmware_sim.mavlink.link import Link, LinkConfig, LinkCounters, Payloads
-from firmware_sim.mavlink.own_streams import OwnStreams
-from firmware_sim.mavlink.radio import Radio
-from firmware_sim.mavlink.senders import Senders
+from firmware_sim.mavlink.own_streams import OwnStreams, Radio
 from firmware_sim.mavlink.services import handle, peers, send_pending
 from firmware_sim.mavlink.services.context import Context, sender
 from firmware_sim.mavlink.services.transfers import RunningCalibration
 from firmware_sim.mavlink.streams import BUILDERS, Builder
 from firmware_sim.mavlink.streams.status import system_time
 from firmware_sim.mavlink.telemetry import TickContext, flown_of
-from firmware_sim.mavlink.texts import REPLY_IDS, TextEncoder
-from firmware_sim.mavlink.tlog import TlogWriter
-from firmware_sim.mavlink.traffic_log import TrafficLog
+from firmware_sim.mavlink.tlog import TlogWriter, TrafficLog
 from firmware_sim.storage import Storage
 
 _DISCARD_CALLS = 16

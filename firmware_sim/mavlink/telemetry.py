@@ -65,6 +65,17 @@ _SOURCES: Final = (
 )
 _AT: Final = {name: place for place, name in enumerate(_SOURCES)}
 
+_PLACED, _WANTED, _GOAL_PART, _FIX_PART, _ESC_PART, _HEALTH = (1 << bit for bit in range(6))
+_PART_OF: Final = {
+    _PLACED: ("located", "lat_e7", "lon_e7", "alt_mm", "above_home_mm", "hud_alt", "amsl", "up"),
+    _WANTED: ("sp_qw", "sp_mask", "sp_vx", "sp_thrust", "throttle", "pwm_1"),
+    _WANTED | _GOAL_PART: ("goal_known",),
+    _FIX_PART: ("fix_known",),
+    _ESC_PART: ("esc_cdeg_1", "rpm_1"),
+    _HEALTH: ("parts_present",),
+}
+"""Sources that are computed in parts, and only for the messages that have one of them."""
+
 _POSE_DIAGONAL = ("var_x", "var_y", "var_z", "var_roll", "var_pitch", "var_yaw")
 _VELOCITY_DIAGONAL = ("var_vx", "var_vy", "var_vz", "nan", "nan", "nan")
 
@@ -175,6 +186,7 @@ class _Table(NamedTuple):
     extras: Ints  # (m,) seed of the checksum
     sizes: Ints  # (m,) bytes of the payload
     needs: Ints  # (m,) source that must not be 0
+    parts: Ints  # (m,) bits of the parts of the sources that it needs
     first: Ints  # (m + 1,) of the fields
     sources: Ints  # (f,)
     offsets: Ints  # (f,) in the payload
@@ -185,7 +197,11 @@ def _table() -> _Table:
     heads, fields, first = [], [], [0]
     for name, sources in FIELDS.items():
         kind = dialect.mavlink_map[message_id(name)]
-        heads.append((kind.id, kind.crc_extra, kind.unpacker.size, _AT[NEEDS.get(name, "one")]))
+        need = NEEDS.get(name, "one")
+        parts = 0
+        for part, marks in _PART_OF.items():
+            parts |= part if {need, *sources} & {*marks} else 0
+        heads.append((kind.id, kind.crc_extra, kind.unpacker.size, _AT[need], parts))
         formats = _FIELD_FORMAT.findall(kind.unpacker.format)
         counts = [int(count or 1) for count, _ in formats]
         sizes = [count * _SIZES[code] for count, (_, code) in zip(counts, formats, strict=True)]
@@ -204,9 +220,9 @@ def _table() -> _Table:
         # Extension fields come last; those that are not named are zero.
         fields += [(_AT[source], *place) for source, place in zip(sources, places, strict=False)]
         first.append(len(fields))
-    ids, extras, sizes_, needs = np.array(heads, np.int64).T
+    ids, extras, sizes_, needs, parts_ = np.array(heads, np.int64).T
     sources_, offsets, kinds = np.array(fields, np.int64).T
-    columns = (ids, extras, sizes_, needs, np.array(first), sources_, offsets, kinds)
+    columns = (ids, extras, sizes_, needs, parts_, np.array(first), sources_, offsets, kinds)
     return _Table(*(np.ascontiguousarray(column, np.int64) for column in columns))
 
 
@@ -341,7 +357,7 @@ def _estimated(v: Vector, row: Vector) -> None:
 
 
 @kernel
-def _placed(v: Vector, row: Vector, pressure_alt: float, context: Vector) -> None:
+def _placed(v: Vector, row: Vector, context: Vector) -> None:
     """Write where the vehicle is on the globe, and its altitudes."""
     down, origin_m, home_m = row[es.P + 2], context[_ORIGIN_M], context[_HOME_M]
     known = not math.isnan(origin_m)
@@ -356,7 +372,7 @@ def _placed(v: Vector, row: Vector, pressure_alt: float, context: Vector) -> Non
         v[_LAT_E7 + 3] = units.mm(here.altitude_m - (origin_m if math.isnan(home_m) else home_m))
     v[_UP] = v[_ABOVE_HOME] = -down
     v[_AMSL] = origin_m - down
-    v[_HUD_ALT] = origin_m - down if known else pressure_alt
+    v[_HUD_ALT] = origin_m - down if known else v[_PRESSURE + 1]
     if known and not math.isnan(home_m):
         v[_ABOVE_HOME] = origin_m - down - home_m
     v[_TERRAIN_AT], v[_TERRAIN_AT + 1] = context[_TERRAIN], context[_CLEARANCE]
@@ -468,8 +484,8 @@ def _health(v: Vector, row: Fields, context: Vector) -> None:
 
 
 @large_kernel
-def _sources(v: Vector, row: Fields, context: Vector) -> None:
-    """Write the sources (len(_SOURCES),) of a tick's log."""
+def _sources(v: Vector, row: Fields) -> None:
+    """Write the sources (len(_SOURCES),) of a tick's log that belong to no part."""
     s = row.state
     v[_ZERO], v[_NAN], v[_ONE], v[_HEALTHY] = 0.0, math.nan, 1.0, row.healthy
     v[_TIME_US], v[_TIME_US + 1] = row.time_us, units.boot_ms(row.time_us)
@@ -482,15 +498,25 @@ def _sources(v: Vector, row: Fields, context: Vector) -> None:
         v[_AX + i] = row.accel[i] - s[es.ACCEL_BIAS + i]
         v[_AX + 3 + i] = row.gyro[i] - s[es.GYRO_BIAS + i]
         v[_AX + 6 + i] = row.mag[i]
-    pressure_alt = atmosphere.altitude_m(row.pressure_hpa)
-    v[_PRESSURE], v[_PRESSURE + 1] = row.pressure_hpa, pressure_alt
+    v[_PRESSURE], v[_PRESSURE + 1] = row.pressure_hpa, atmosphere.altitude_m(row.pressure_hpa)
     v[_PRESSURE + 2], v[_PRESSURE + 3] = row.temperature_c, _IMU_FIELDS
-    _placed(v, s, pressure_alt, context)
-    _wanted(v, row, context)
-    _goal(v, context)
-    _fix(v, row, context)
-    _speed_controllers(v, row, context)
-    _health(v, row, context)
+
+
+@large_kernel
+def _parts(v: Vector, row: Fields, context: Vector, parts: int) -> None:
+    """Write the sources of some parts, after `_sources`."""
+    if parts & _PLACED:
+        _placed(v, row.state, context)
+    if parts & _WANTED:
+        _wanted(v, row, context)
+    if parts & _GOAL_PART:
+        _goal(v, context)
+    if parts & _FIX_PART:
+        _fix(v, row, context)
+    if parts & _ESC_PART:
+        _speed_controllers(v, row, context)
+    if parts & _HEALTH:
+        _health(v, row, context)
 
 
 (_ZERO, _NAN, _ONE, _HEALTHY, _LOCATED, _TIME_US, _ROLL, _QW, _P, _X, _VX, _VAR_X, _VAR_ROLL) = (
@@ -608,7 +634,7 @@ def _pack(
     bits = word.view(np.uint8)
     at, n, next_us = 0, 0, _NEVER
     for k in range(len(flown)):
-        row, made = flown[k], False
+        row, made, parts = flown[k], False, 0
         now_us = row.time_us + after_us
         for s in range(len(numbers)):
             if numbers[s] < 0 or interval_us[s] == 0 or due_us[s] > now_us or n == most:
@@ -616,8 +642,12 @@ def _pack(
             late_us = now_us - due_us[s]
             due_us[s] += interval_us[s] * (1 + late_us // interval_us[s])
             if not made:
-                _sources(v, row, context)
+                _sources(v, row)
                 made = True
+            missing = _TABLE.parts[numbers[s]] & ~parts
+            if missing != 0:
+                _parts(v, row, context, missing)
+                parts |= missing
             if v[_TABLE.needs[numbers[s]]] != 0.0:
                 at = _frame(numbers[s], v, system, seq + n & 0xFF, out, at, word, bits)
                 ends[n] = at
@@ -653,8 +683,8 @@ class Packer:
         """
         most *= len(flown)
         if len(self._ends) < most:
-            self._ends = np.zeros(most, np.int64)
-            self._out = np.zeros(most * _LARGEST, np.uint8)
+            self._ends = np.empty(most, np.int64)
+            self._out = np.empty(most * _LARGEST, np.uint8)
         n, next_us = _pack(
             *(flown, after_us, context, numbers, due_us, interval_us, system, seq, most),
             *(self._out, self._ends),

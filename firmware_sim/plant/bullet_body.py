@@ -77,8 +77,16 @@ NO_CLIENT = -1
 """Number of a client that has been closed: every call with it raises pybullet.error."""
 
 
+_idle: list[Any] = []
+"""Clients of worlds that were closed: one that is emptied costs a tenth of a new one."""
+
+
 def connect() -> Any:
-    """Return a client of a new physics server in this process."""
+    """Return a client of an empty physics server in this process."""
+    if _idle:
+        client = _idle.pop()
+        client.resetSimulation()
+        return client
     with silenced_output():
         return BulletClient(pybullet.DIRECT)
 
@@ -250,8 +258,8 @@ class World:
     def close(self) -> None:
         """Release the physics server."""
         if self.number != NO_CLIENT:
-            self.client.disconnect()
-            self.number = NO_CLIENT
+            _idle.append(self.client)
+            self.client, self.number = None, NO_CLIENT
 
     def move_obstacles(self, time_us: int, vehicle: Vector) -> None:
         """Move what moves to where it is `time_us` [µs] after the start of the episode.

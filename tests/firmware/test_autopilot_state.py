@@ -64,7 +64,7 @@ def test_a_state_shows_what_was_ordered_since_the_tick() -> None:
         assert after.time_us == before.time_us
         assert after.home == home
         rig.run(0.5)
-        rig.ap.set_home_here()
+        rig.ap.set_home(None)
         moved = rig.ap.state().home
         assert moved is not None
         assert moved.altitude_m > home.altitude_m + 2.0

@@ -30,7 +30,6 @@ from firmware_sim.autopilot.failsafes.framework import (
     Intervention,
     Outcome,
     Vehicle,
-    defer,
     update,
 )
 from firmware_sim.autopilot.failsafes.settings import Settings
@@ -166,22 +165,6 @@ def test_already_returning_or_landing_it_only_warns() -> None:
         m = flying(mode, nav_rcl_act=2)
         m.step(manual_control_signal_lost=True)
         assert (m.action(), m.last.mode) == (Action.WARN, mode)
-
-
-def test_deferral() -> None:
-    m = flying(Mode.POSITION, nav_rcl_act=2, gf_action=3, com_fail_act_t=0.0)
-    m.state = defer(m.state, m.time_us, 10.0)
-    m.step(manual_control_signal_lost=True)
-    assert (m.action(), m.state.deferring) == (Action.NONE, True)
-    m.step(9 * S)
-    assert m.action() is Action.NONE
-    m.step(2 * S)
-    assert (m.action(), m.state.deferring) == (Action.RETURN, False)
-    assert defer(m.state, m.time_us) == m.state, "refused in a failsafe"
-    m = flying(Mode.POSITION, nav_rcl_act=2, gf_action=3, com_fail_act_t=0.0)
-    m.state = defer(m.state, m.time_us)
-    m.step(geofence=FenceBreach(altitude=True))
-    assert m.action() is Action.RETURN, "a fence cannot be deferred"
 
 
 def test_a_condition_that_flaps_acts_in_the_end() -> None:

@@ -15,7 +15,7 @@ from airl_mav.core.clock import SimClock
 from airl_mav.core.constants import US_PER_S
 from airl_mav.core.signing import StoredSigning
 from firmware_sim.autopilot.autopilot_state import Arming
-from firmware_sim.mavlink import clients, codec, limits, server, traffic_log
+from firmware_sim.mavlink import clients, codec, limits, server, tlog
 from firmware_sim.mavlink.codec import Decoder, WireMessage
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from firmware_sim.mavlink.link import gcs_link, onboard_link
@@ -233,7 +233,7 @@ def test_who_pretends_to_be_the_vehicle_is_heard_by_nobody() -> None:
 
 
 def test_strangers_fill_no_disk_with_logs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(traffic_log, "MAX_BYTES", 5_000)
+    monkeypatch.setattr(tlog, "MAX_BYTES", 5_000)
     field = Field()
     main = TlogWriter(tmp_path / "flight-001.tlog", 0)
     field.server.log_to(main, "gcs")
@@ -243,7 +243,7 @@ def test_strangers_fill_no_disk_with_logs(tmp_path: Path, monkeypatch: pytest.Mo
     field.server.log_to(None, "gcs")
     main.close()
     logs = sorted(tmp_path.glob("flight-001.*.tlog"))
-    assert len(logs) == traffic_log.MAX_LOGS
+    assert len(logs) == tlog.MAX_LOGS
     assert max(path.stat().st_size for path in logs) < 6_000
     assert (tmp_path / "flight-001.tlog").stat().st_size > 20_000
 

@@ -739,15 +739,17 @@ def test_the_truth_that_was_given_out_does_not_change(make: PlantMaker) -> None:
 
 def test_a_closed_plant_cannot_touch_another_one(make: PlantMaker) -> None:
     pybullet = pytest.importorskip("pybullet")
-    from firmware_sim.plant.bullet_body import BulletBody
+    from firmware_sim.plant.bullet_body import NO_CLIENT, BulletBody
 
     closed = make(plant="pybullet")
     assert isinstance(closed.body, BulletBody)
     number = closed.body.world.number
     closed.close()
     closed.close()
-    assert not pybullet.isConnected(number)
-    other = make(plant="pybullet")  # pybullet gives it the number that has become free
+    assert closed.body.world.number == NO_CLIENT
+    other = make(plant="pybullet")
+    assert isinstance(other.body, BulletBody)
+    assert other.body.world.number == number  # the same physics server, emptied
     start = other.position
     with pytest.raises(pybullet.error, match="Not connected"):
         closed.step(HOVER)

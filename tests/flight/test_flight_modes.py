@@ -134,7 +134,7 @@ def test_home_can_be_moved_to_where_the_vehicle_is() -> None:
         rig.run(4.0)
         rig.stream(STILL)
         rig.run(2.0)
-        assert rig.ap.set_home_here() is Result.ACCEPTED
+        assert rig.ap.set_home(None) is Result.ACCEPTED
         home = rig.truth.position.copy()
         rig.stream(velocity_setpoint(0.0, 4.0, 0.0))
         rig.run(4.0)

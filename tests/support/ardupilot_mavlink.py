@@ -17,7 +17,7 @@ from firmware_sim.autopilot.autopilot_state import (
     Setpoint,
     Severity,
 )
-from firmware_sim.mavlink.codec import Values, WireMessage, dialect
+from firmware_sim.mavlink.codec import TextEncoder, Values, WireMessage, dialect
 from firmware_sim.mavlink.endpoint import UdpEndpoint
 from firmware_sim.mavlink.event_buffer import EventBuffer
 from firmware_sim.mavlink.link import Link, LinkConfig
@@ -25,7 +25,6 @@ from firmware_sim.mavlink.services import commands, handle
 from firmware_sim.mavlink.services.context import Command, Context, for_vehicle, sender
 from firmware_sim.mavlink.streams import BUILDERS, Builder, status
 from firmware_sim.mavlink.telemetry import PARTS, TickContext, flown_of
-from firmware_sim.mavlink.texts import TextEncoder
 from tests.support.ardupilot_copter import LAND, STABILIZE, Copter
 
 ARDUPILOTMEGA, QUADROTOR = 3, 2

@@ -68,4 +68,3 @@ class Options(NamedTuple):
     clear: Clear = Clear.WITH_CONDITION
     takeover: Takeover = Takeover.AUTO
     cause: Cause = Cause.GENERIC
-    deferrable: bool = True

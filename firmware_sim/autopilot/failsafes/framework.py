@@ -18,9 +18,6 @@ from firmware_sim.autopilot.failsafes.fallback import mode_fallback, mode_of, po
 from firmware_sim.autopilot.failsafes.settings import Settings
 from firmware_sim.autopilot.failsafes.table import Situation, Trigger, answers
 
-DEFER_S = 30.0
-"""How long failsafes may be deferred where no time is given [s]."""
-
 
 class Vehicle(NamedTuple):
     """What the failsafes must know of the flight."""
@@ -67,10 +64,6 @@ class FailsafeState(NamedTuple):
     """How long the next wait in Hold lasts; None = as COM_FAIL_ACT_T says."""
     delay_us: int = 0
     """How long the present wait in Hold still lasts."""
-    defer_until_us: int | None = None
-    """Failsafes are deferred until then; None = they are not."""
-    deferring: bool = False
-    """Whether an action is being deferred."""
     armed_us: int | None = None
     manual_control_lost_at_arming: bool = False
     battery_at_arming: BatteryWarning = BatteryWarning.NONE
@@ -104,7 +97,6 @@ class _Choice(NamedTuple):
     delayed: Action = Action.NONE
     cause: Cause = Cause.GENERIC
     taken_over: bool = False
-    deferred: bool = False
 
 
 def update(
@@ -154,32 +146,16 @@ def update(
         armed=vehicle.armed,
         intended=intended,
         start_delay_us=_start_delay(state, settings, elapsed_us, choice.delayed),
-        deferring=choice.deferred,
     )
     mode = mode_of(choice.action, intended)
     return Outcome(state, mode, intended, text, choice.delayed, choice.cause)
-
-
-def defer(state: FailsafeState, time_us: int, seconds: float = DEFER_S) -> FailsafeState:
-    """Put off all failsafes that may be put off; refused (no change) while one is active.
-
-    `seconds` <= 0 ends the deferral.
-    """
-    if seconds <= 0.0:
-        return state._replace(defer_until_us=None)
-    if state.active:
-        return state
-    return state._replace(defer_until_us=time_us + round(seconds * US_PER_S))
 
 
 def _begin(
     state: FailsafeState, time_us: int, elapsed_us: int, vehicle: Vehicle, conditions: Conditions
 ) -> FailsafeState:
     """Let the delays run, and note what was wrong at arming."""
-    if not state.deferring:
-        state = state._replace(delay_us=max(0, state.delay_us - elapsed_us))
-    if state.defer_until_us is not None and time_us > state.defer_until_us:
-        state = state._replace(defer_until_us=None)
+    state = state._replace(delay_us=max(0, state.delay_us - elapsed_us))
     lost = conditions.manual_control_signal_lost
     if vehicle.armed and not state.armed:
         state = state._replace(
@@ -277,9 +253,6 @@ def _select(
         if item.options.action > worst.action:
             worst = item.options
     action, cause, intended = worst.action, worst.cause, vehicle.intended
-    deferrable = all(item.options.deferrable for item in state.held)
-    if state.defer_until_us is not None and deferrable and action is not Action.NONE:
-        return _Choice(Action.NONE, intended, deferred=action > Action.WARN)
     delayed = Action.NONE
     if (
         state.delay_us > 0

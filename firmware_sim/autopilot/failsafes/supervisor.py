@@ -247,7 +247,7 @@ class Supervisor:
         armed = flight.phase >= _GROUND
         seen = (self.conditions, armed, flight.intended, finished, self._settings)
         # What changes with time alone: delays, and rows that end some time after arming.
-        waiting = state.delay_us > 0 or state.deferring or state.start_delay_us is not None
+        waiting = state.delay_us > 0 or state.start_delay_us is not None
         timed = self.conditions.fd_critical_failure or self.conditions.battery_unhealthy
         idle = not (waiting or timed or state.taken_over)
         if idle and seen == self._decided and intervention == NO_INTERVENTION:

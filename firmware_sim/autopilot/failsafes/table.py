@@ -107,10 +107,6 @@ def _caused(answers: Mapping[int, Options], cause: Cause) -> dict[int, Options]:
     return {value: options._replace(cause=cause) for value, options in answers.items()}
 
 
-def _undeferred(answers: Mapping[int, Options]) -> dict[int, Options]:
-    return {value: options._replace(deferrable=False) for value, options in answers.items()}
-
-
 _LANDING = (Mode.LAND, Mode.PRECISION_LAND)
 _LINK_LOSS = {0: _NONE, 1: _HOLD, 2: _RETURN, 3: _LAND, 5: _TERMINATE, 6: _DISARM}
 """NAV_RCL_ACT and NAV_DLL_ACT."""
@@ -245,9 +241,9 @@ TABLE: tuple[Row, ...] = (
         "Wind above its limit",
         "the estimated wind exceeds its limit",
         lambda s: s.conditions.wind_limit_exceeded,
-        _undeferred(_LIMITS),
+        _LIMITS,
         "COM_WIND_MAX_ACT",
-        Options(Action.WARN, deferrable=False),
+        Options(Action.WARN),
         related=("COM_WIND_MAX",),
     ),
     Row(
@@ -255,7 +251,7 @@ TABLE: tuple[Row, ...] = (
         "Flight time over",
         "so long since take-off",
         lambda s: s.conditions.flight_time_limit_exceeded,
-        {0: Options(Action.RETURN, deferrable=False)},
+        {0: Options(Action.RETURN)},
         related=("COM_FLT_TIME_MAX",),
     ),
     Row(
@@ -289,9 +285,9 @@ TABLE: tuple[Row, ...] = (
         "Geofence breached",
         "too far from home, too high above it, or outside the uploaded fence",
         lambda s: any(s.conditions.geofence),
-        _undeferred(_LIMITS),
+        _LIMITS,
         "GF_ACTION",
-        Options(Action.WARN, deferrable=False),
+        Options(Action.WARN),
         related=("GF_MAX_HOR_DIST", "GF_MAX_VER_DIST"),
     ),
     Row(
@@ -308,7 +304,7 @@ TABLE: tuple[Row, ...] = (
         "Battery unhealthy at arming",
         "the battery reports nothing, within COM_SPOOLUP_TIME of arming",
         lambda s: s.conditions.battery_unhealthy and _spooling(s),
-        {0: Options(Action.DISARM, deferrable=False)},
+        {0: Options(Action.DISARM)},
     ),
     Row(
         Trigger.BATTERY_UNHEALTHY,
@@ -343,7 +339,7 @@ TABLE: tuple[Row, ...] = (
         "Attitude failure at take-off",
         "roll or pitch out of limits, within COM_SPOOLUP_TIME + COM_LKDOWN_TKO of arming",
         lambda s: s.conditions.fd_critical_failure and _taking_off(s),
-        {0: Options(Action.DISARM, deferrable=False)},
+        {0: Options(Action.DISARM)},
         related=("FD_FAIL_R", "FD_FAIL_P", "FD_FAIL_R_TTRI", "FD_FAIL_P_TTRI", "COM_LKDOWN_TKO"),
     ),
     Row(
@@ -351,7 +347,7 @@ TABLE: tuple[Row, ...] = (
         "Attitude failure in flight, CBRK_FLIGHTTERM 0",
         "roll or pitch out of limits",
         lambda s: s.conditions.fd_critical_failure and not _taking_off(s) and _terminates(s),
-        {0: Options(Action.TERMINATE, deferrable=False)},
+        {0: Options(Action.TERMINATE)},
         related=("FD_FAIL_R", "FD_FAIL_P", "FD_FAIL_R_TTRI", "FD_FAIL_P_TTRI", "CBRK_FLIGHTTERM"),
     ),
     Row(
@@ -391,6 +387,6 @@ def answers(situation: Situation) -> list[tuple[Trigger, Options]]:
     found = [(trigger, options) for trigger, options in found if options.action is not Action.NONE]
     fallback = mode_fallback(situation.conditions, situation.settings, situation.intended)
     if fallback is not Action.NONE:
-        options = Options(fallback, takeover=Takeover.ALWAYS, deferrable=False)
+        options = Options(fallback, takeover=Takeover.ALWAYS)
         found.append((Trigger.MODE_FALLBACK, options))
     return found

@@ -12,7 +12,7 @@ from firmware_sim.autopilot.port import AutopilotPort
 from firmware_sim.mavlink.codec import COMPONENT_ID, SYSTEM_ID, WireMessage
 from firmware_sim.mavlink.event_buffer import EventBuffer
 from firmware_sim.mavlink.link import Link
-from firmware_sim.mavlink.radio import Radio
+from firmware_sim.mavlink.own_streams import Radio
 from firmware_sim.mavlink.services.transfers import (
     FtpClient,
     LogDownload,
