@@ -44,7 +44,10 @@ assert not new, new
 @pytest.mark.parametrize(
     "vehicle",
     [
-        *("quad", "quad-rgb", "quad-indoor", "quad-flow"),
+        "quad",
+        pytest.param("quad-rgb", marks=pytest.mark.nightly),
+        pytest.param("quad-indoor", marks=pytest.mark.nightly),
+        pytest.param("quad-flow", marks=pytest.mark.nightly),
         pytest.param("quad-vio", marks=pytest.mark.nightly),
     ],
 )

@@ -230,6 +230,7 @@ class Reference:
         self.variance = float(self.weights @ (self.p[:, 2, 2] + off**2))
 
 
+@pytest.mark.nightly
 def test_it_is_the_reference_to_rounding(ticks: list[Tick]) -> None:
     reference = Reference()
     estimator = YawEstimator()

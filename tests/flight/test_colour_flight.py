@@ -28,6 +28,8 @@ from tests.support.lockstep_kit import demo_scenario
 from tests.support.poses import at_rest
 from tests.support.trained_here import Watching, trained
 
+pytestmark = pytest.mark.nightly
+
 SEED = 3
 
 TRAINING = """

@@ -273,7 +273,7 @@ def test_what_is_finished_is_shown_again_and_not_flown(
         ({"time_limit_s": 60.0}, "time_limit_s = 120.0, not 60.0"),
         ({"computer": "ras-pi-4"}, "computer = 'workstation', not 'ras-pi-4'"),
         ({"hover_after_s": 0.1}, "watchdog.hover_after_s = None, not 0.1"),
-        ({"level": "gym"}, "level = 'lockstep', not 'gym'"),
+        pytest.param({"level": "gym"}, "level = 'lockstep', not 'gym'", marks=pytest.mark.nightly),
     ],
 )
 def test_another_run_is_not_mixed_in(

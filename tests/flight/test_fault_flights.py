@@ -34,6 +34,7 @@ def flown(*faults: str) -> EpisodeRecord:
     return fly(resolved, resolved.fresh_policy(SEED), 0, SEED).record
 
 
+@pytest.mark.nightly
 def test_a_flight_with_every_sort_of_fault_is_the_same_every_time() -> None:
     faults = (
         "gyro noise 3x at 2s",

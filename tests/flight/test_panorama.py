@@ -106,7 +106,7 @@ def _check_scans(seen: list[Observation]) -> None:
         assert (ours["depth"][:, :, : len(each.states)] < 255).any()
 
 
-@pytest.mark.parametrize("compensate", [False, True])
+@pytest.mark.parametrize("compensate", [False, pytest.param(True, marks=pytest.mark.nightly)])
 def test_the_twin_flies_it_too(*, compensate: bool) -> None:
     """Compensated it sees each image carried forward: also that of what lies behind."""
     spec = {"vehicle": "quad-panorama", "arena": "no-obstacles", "compensate": compensate}

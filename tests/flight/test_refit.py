@@ -91,6 +91,7 @@ def test_what_is_true_is_found(refitted: Refitted) -> None:
     assert link_ms == pytest.approx(1e3 * uplink_s(flight) + 8.0, abs=10.0)
 
 
+@pytest.mark.nightly
 def test_what_is_written_loads_as_it_is(refitted: Refitted) -> None:
     out, found = refitted.out, refitted.found
     text = (out / "vehicle.toml").read_text(encoding="utf-8")

@@ -78,6 +78,7 @@ def scenario(policy: Path, **changes: object) -> ResolvedScenario:
     return demo_scenario(**({"time_limit_s": 5.0} | asked | changes))
 
 
+@pytest.mark.nightly
 def test_the_card_says_which_cameras_it_needs(policy: Path) -> None:
     card = load_card(policy)
     assert list(card.observation.cameras) == ["down", "left"]

@@ -20,6 +20,8 @@ from airl_mav.profiles.arena import ArenaSpec
 from airl_mav.profiles.loading import load_profile
 from tests.learning.test_fleet_meshes import CAMERA, MOUNT, RANGE_M, scattered
 
+pytestmark = pytest.mark.nightly
+
 SEEDS = range(4)
 
 

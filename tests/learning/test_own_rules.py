@@ -179,6 +179,7 @@ def test_a_layout_that_no_network_can_take_is_told_in_one_line(
         NavigationVectorEnv(2, arena="no-obstacles", layout=f"{parts}:{name}").reset(seed=1)
 
 
+@pytest.mark.nightly
 def test_a_policy_with_the_user_s_layout_and_actions_asks_for_trust(
     parts: str, tmp_path: Path
 ) -> None:

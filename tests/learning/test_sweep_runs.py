@@ -26,7 +26,12 @@ from tests.support.command_line import airl
 from tests.support.processes import PATIENCE_S, Running, has_ended, running, wait_until
 from tests.support.sweep_kit import TINY, write_sweep_file
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("sweep"), pytest.mark.timeout(400)]
+pytestmark = [
+    pytest.mark.nightly,
+    pytest.mark.slow,
+    pytest.mark.xdist_group("sweep"),
+    pytest.mark.timeout(400),
+]
 
 SEED, TRIALS = 6, 2
 """Of the trainings, and how many there are: one of each size."""

@@ -127,6 +127,7 @@ distortion = [-0.05, 0.008, -0.0045, 0.0004]
 """
 
 
+@pytest.mark.nightly
 def test_a_fisheye_is_calibrated_as_one(tmp_path: Path) -> None:
     """Every pixel, led through calibration as OpenCV has it, ends where the arena is."""
     pytest.importorskip("foxglove", reason="needs the [export] extra")

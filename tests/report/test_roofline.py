@@ -87,6 +87,7 @@ def test_the_model_is_the_closed_form_of_the_reaction_time(found: Roofline) -> N
     assert heavy.f1_roof_m_s == pytest.approx(math.sqrt(2.0 * a * room_m))
 
 
+@pytest.mark.nightly
 def test_every_computer_is_carried(found: Roofline) -> None:
     pi, ground, heavy = (of(found, name) for name in ("ras-pi-4", "workstation", "heavy"))
     assert [p.vehicle_kg for p in (pi, ground, heavy)] == pytest.approx([1.546, 1.5, 2.0])

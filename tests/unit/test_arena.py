@@ -242,6 +242,7 @@ def digest(arena: Arena) -> str:
     return hashlib.sha256(b"".join(np.ascontiguousarray(a).tobytes() for a in arrays)).hexdigest()
 
 
+@pytest.mark.nightly
 def test_same_seed_same_arena_in_another_process() -> None:
     spec = shipped("dynamic-obstacles")
     mine = [digest(make(spec, seed)) for seed in range(4)]

@@ -53,6 +53,7 @@ class Assets(HTMLParser):
             self.found.append(values.get("href") or "")
 
 
+@pytest.mark.nightly
 def test_pages_load_nothing_from_the_network(site: Path) -> None:
     pages = list(site.rglob("*.html"))
     assert len(pages) > len(PAGES)
@@ -66,6 +67,7 @@ def test_pages_load_nothing_from_the_network(site: Path) -> None:
         assert not re.search(r"url\(['\"]?(https?:)?//", sheet.read_text(encoding="utf-8"))
 
 
+@pytest.mark.nightly
 def test_reference_shows_every_field_of_a_vehicle(site: Path) -> None:
     text = (site / "reference" / "profiles.html").read_text(encoding="utf-8")
     for name in ("mass_kg", "thrust_curve", "gps", "motors", "workloads.NAME.latency"):

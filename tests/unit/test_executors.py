@@ -188,6 +188,7 @@ def test_a_worker_lives_on_over_the_runs_and_starts_each_anew(tmp_path: Path) ->
     assert not is_running(second)
 
 
+@pytest.mark.nightly
 def test_a_slow_job_holds_nobody_up(tmp_path: Path) -> None:
     # Dealt out beforehand, half of the others would wait for the first, and it for them.
     start = partial(worker_jobs.all_but_the_first, tmp_path, 9)

@@ -86,6 +86,7 @@ def until(cache: Path, name: str) -> Iterator[bool]:
         yield name in compiled(cache)
 
 
+@pytest.mark.nightly
 def test_a_step_is_shown_and_the_next_start_prints_nothing(cache: Path) -> None:
     first = shown().splitlines()
     assert first[0] == f"{LABEL}: 0 of 3, {first[0].rpartition(', ')[2]}"

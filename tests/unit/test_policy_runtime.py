@@ -97,6 +97,7 @@ class Answers:
 # --- runtimes
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", POLICIES)
 def test_torch_and_onnx_give_the_same(exported: Path, name: str) -> None:
     seen = noise(100)
