@@ -28,12 +28,13 @@ from firmware_sim.autopilot.range_finder import Aids, RangeFinder
 from firmware_sim.autopilot.terrain_filter import TerrainFilter
 from firmware_sim.autopilot.yaw_estimator import YawEstimator
 from firmware_sim.engine.controller import Controller
-from firmware_sim.engine.record import RISING
+from firmware_sim.engine.record import FLOWN_TICK, RISING
 from firmware_sim.engine.ticks import detect_record
 from firmware_sim.interfaces import DistanceReading
 from firmware_sim.mavlink.endpoint import MemoryEndpoint
 from firmware_sim.mavlink.link import gcs_link, onboard_link
 from firmware_sim.mavlink.server import MavlinkServer
+from firmware_sim.mavlink.telemetry import Packer, TickContext
 from firmware_sim.plant.camera_server import SimulatedCamera
 from firmware_sim.simulation import EpisodeSetup, Simulation, builtin_autopilot
 
@@ -64,13 +65,19 @@ def compile_flight(vehicle: str, plant: PlantName) -> None:
 
 
 def compile_ticks(vehicle: str, plant: PlantName) -> None:
-    """Compile plant, flight controller and MAVLink streams, without arena and cameras."""
+    """Compile plant and flight controller, without arena and cameras."""
     _fly(VehicleProfile.model_validate_json(vehicle), plant, None)
 
 
-def compile_camera(vehicle: str) -> None:
-    """Compile arenas and cameras."""
+def compile_others(vehicle: str) -> None:
+    """Compile MAVLink streams, auxiliary estimators, arenas and cameras."""
     profile = VehicleProfile.model_validate_json(vehicle)
+    # First what the ticks of the other process need: it finds it in the cache.
+    none = np.zeros(1, np.int64)
+    flown, context = np.zeros(1, FLOWN_TICK), np.zeros(TickContext.SIZE)
+    Packer().pack(flown, 0, context, none, none.copy(), none.copy(), 1, 0, 1)
+    _fuse_in_the_air()
+    _measure_the_ground(builtin_autopilot(EpisodeSetup(profile, None, 0)).parameters.value)
     SimulatedCamera(profile.camera, _arena(profile), further=profile.cameras)
 
 

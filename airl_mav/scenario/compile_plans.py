@@ -28,8 +28,8 @@ def flight_plan(vehicle: VehicleProfile, plant: PlantName) -> CompilePlan:
         "flight",
         "-".join((plant, *sorted(cameras), *sorted(sensors))),
         (
-            CompileJob(f"{_FLIGHT}:compile_ticks", {"vehicle": profile, "plant": plant}, 172),
-            CompileJob(f"{_FLIGHT}:compile_camera", {"vehicle": profile}, 43),
+            CompileJob(f"{_FLIGHT}:compile_ticks", {"vehicle": profile, "plant": plant}, 128),
+            CompileJob(f"{_FLIGHT}:compile_others", {"vehicle": profile}, 92),
         ),
         CompileJob(f"{_FLIGHT}:compile_flight", {"vehicle": profile, "plant": plant}, 5),
     )

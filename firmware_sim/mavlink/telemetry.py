@@ -253,6 +253,8 @@ _UNKNOWN = (math.nan,) * 4
 class TickContext:
     """Values of the messages that are not in a tick's log, kept until one of them changes."""
 
+    SIZE = 23
+
     def __init__(self) -> None:
         self._values: tuple[float, ...] = ()
         self._revision: object = None
